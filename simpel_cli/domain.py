@@ -1,0 +1,44 @@
+"""The box on which functions are compared: the measurement distribution zeta of the functional prior."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli.encoding import Encoding
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Uniform distribution on the declared ranges of states and inputs.
+
+    Args:
+        encoding: gives the quantities (with ranges) and the map to network inputs.
+    """
+
+    encoding: Encoding
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner in physical units, each (ds + (stack+1) du,)."""
+        enc = self.encoding
+        quantities = [*enc.states, *(list(enc.inputs) * (enc.stack + 1))]
+        return np.array([q.low for q in quantities]), np.array([q.high for q in quantities])
+
+    def sample(self, key: PRNGKeyArray, n: int, dtype: jnp.dtype) -> Float[Array, "n dx"]:
+        """Draw n network inputs (data units), uniform in the box, angles encoded."""
+        low, high = (jnp.asarray(b, dtype) for b in self.bounds())
+        points = jax.random.uniform(key, (n, low.shape[0]), dtype) * (high - low)[None] + low[None]
+        ds = len(self.encoding.states)
+        return self.encoding.to_x(points[:, :ds], points[:, ds:])
+
+    def x_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation of a network input: (high+low)/2 and (high-low)/sqrt(12); angles 0, 1/sqrt 2."""
+        low, high = self.bounds()
+        mean, std = [], []
+        angles = [*(q.periodic for q in self.encoding.states), *[False] * (len(low) - len(self.encoding.states))]
+        for a, b, periodic in zip(low, high, angles, strict=True):
+            mean.extend([0.0, 0.0] if periodic else [(a + b) / 2])
+            std.extend([np.sqrt(0.5)] * 2 if periodic else [(b - a) / np.sqrt(12)])
+        return np.array(mean), np.array(std)

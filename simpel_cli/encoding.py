@@ -1,0 +1,105 @@
+"""Coordinates of the learning problem: angles as (sin, cos), past actions stacked, differences as targets.
+
+    x = [enc(state), past actions (oldest first), action]
+    y = [enc(next state) - enc(state), measured outputs]
+
+Everything here is numpy-like and works on numpy and on JAX arrays, single points or batches (last axis = features).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from simulators.model import Quantity
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How physical states, inputs and outputs become the inputs x and targets y of a network.
+
+    Args:
+        states: the states of the model, in order; periodic ones are angles in rad.
+        inputs: the inputs of the model.
+        outputs: measured quantities that are not states.
+        stack: number of past actions in x.
+    """
+
+    states: tuple[Quantity, ...]
+    inputs: tuple[Quantity, ...]
+    outputs: tuple[Quantity, ...] = ()
+    stack: int = 0
+
+    @property
+    def dim_state(self) -> int:
+        """Number of encoded state coordinates."""
+        return sum(2 if q.periodic else 1 for q in self.states)
+
+    @property
+    def dim_x(self) -> int:
+        """Number of network inputs, dx."""
+        return self.dim_state + (self.stack + 1) * len(self.inputs)
+
+    @property
+    def dim_y(self) -> int:
+        """Number of network outputs, dy."""
+        return self.dim_state + len(self.outputs)
+
+    @property
+    def y_names(self) -> tuple[str, ...]:
+        """Name of every target coordinate, e.g. `sin(phi)`, `cos(phi)`, `omega`."""
+        return (*self._state_labels(), *(q.name for q in self.outputs))
+
+    @property
+    def y_units(self) -> tuple[str, ...]:
+        """Unit of every target coordinate; sine and cosine have none."""
+        units = [u for q in self.states for u in (["1", "1"] if q.periodic else [q.unit])]
+        return (*units, *(q.unit for q in self.outputs))
+
+    def _state_labels(self) -> list[str]:
+        return [n for q in self.states for n in ([f"sin({q.name})", f"cos({q.name})"] if q.periodic else [q.name])]
+
+    def per_target(self, values: dict[str, float], default: float) -> np.ndarray:
+        """Spread a value per state or output (in its unit) over the target coordinates, shape (dy,)."""
+        spread = [values.get(q.name, default) for q in self.states for _ in range(2 if q.periodic else 1)]
+        return np.array([*spread, *(values.get(q.name, default) for q in self.outputs)], dtype=float)
+
+    def encode(self, states: Any) -> Any:
+        """Map physical states (..., ds) to encoded ones (..., dim_state)."""
+        xp = np if isinstance(states, np.ndarray) else jnp
+        parts = []
+        for i, q in enumerate(self.states):
+            s = states[..., i : i + 1]
+            parts.extend([xp.sin(s), xp.cos(s)] if q.periodic else [s])
+        return xp.concatenate(parts, axis=-1) if parts else states
+
+    def decode(self, encoded: Any) -> Any:
+        """Map encoded states (..., dim_state) back; atan2 accepts (sin, cos) pairs off the unit circle."""
+        xp = np if isinstance(encoded, np.ndarray) else jnp
+        parts, i = [], 0
+        for q in self.states:
+            if q.periodic:
+                parts.append(xp.arctan2(encoded[..., i], encoded[..., i + 1]))
+                i += 2
+            else:
+                parts.append(encoded[..., i])
+                i += 1
+        return xp.stack(parts, axis=-1) if parts else encoded
+
+    def to_x(self, states: Any, inputs: Any) -> Any:
+        """Network input (..., dx) from physical states (..., ds) and stacked inputs (..., (stack+1) du)."""
+        xp = np if isinstance(states, np.ndarray) else jnp
+        return xp.concatenate([self.encode(states), inputs], axis=-1)
+
+    def split_x(self, x: Any) -> tuple[Any, Any]:
+        """Physical states (..., ds) and stacked inputs (..., (stack+1) du) of network inputs (..., dx)."""
+        return self.decode(x[..., : self.dim_state]), x[..., self.dim_state :]
+
+    def to_y(self, states: Any, next_states: Any, outputs: Any) -> Any:
+        """Target (..., dy): difference of the encoded states, then the measured outputs."""
+        xp = np if isinstance(states, np.ndarray) else jnp
+        return xp.concatenate([self.encode(next_states) - self.encode(states), outputs], axis=-1)
+
+    def advance(self, encoded: Any, y: Any) -> Any:
+        """Encoded state after one step; (sin, cos) pairs are put back on the unit circle."""
+        return self.encode(self.decode(encoded + y[..., : self.dim_state]))

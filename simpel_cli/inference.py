@@ -1,0 +1,164 @@
+"""What every inference rule takes and gives: a problem in normalised units, and init / draw / step / predict.
+
+A posterior = a functional prior x a score estimator x an inference rule. The rule sees arrays only.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from simpel_cli.predictive import Predictive
+
+
+class Normaliser(NamedTuple):
+    """Affine maps between data units and the units in which networks work."""
+
+    x_mean: Float[Array, " dx"]
+    x_std: Float[Array, " dx"]
+    y_mean: Float[Array, " dy"]
+    y_std: Float[Array, " dy"]
+
+    def x(self, x: Float[Array, "n dx"]) -> Float[Array, "n dx"]:
+        """Normalise network inputs."""
+        return (x - self.x_mean[None]) / self.x_std[None]
+
+
+class Bank(NamedTuple):
+    """Prior draws at fixed points, for simulators that can only be queried: (B, dy, N) at inputs (B, dx).
+
+    The first rows belong to the (padded) training inputs, in their order.
+    """
+
+    x: Float[Array, "B dx"]
+    samples: Float[Array, "B dy N"]
+
+
+class Problem(NamedTuple):
+    """Everything a compiled program reads, as one argument of fixed shape (so that runs share programs).
+
+    Training arrays are padded to a common length; only the first `m` rows count. Inputs `x` are in data units,
+    targets `y`, `gap_scale` and `noise_init` in normalised output units.
+    """
+
+    x: Float[Array, "m_padded dx"]
+    y: Float[Array, "m_padded dy"]
+    m: Int[Array, ""]
+    normaliser: Normaliser
+    gap_scale: Float[Array, " dy"]
+    noise_init: Float[Array, " dy"]
+    bank: Bank | None = None
+
+
+class PriorProcess(Protocol):
+    """A prior over functions: draws of its simulator part, and the covariance of its Gaussian part."""
+
+    @property
+    def draws(self) -> int:
+        """Number of simulator draws, N."""
+        ...
+
+    def simulate(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
+        """Draw the simulator part at inputs in data units; data units out."""
+        ...
+
+    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array, " dy"]) -> Float[Array, "dy M M"]:
+        """Covariance of the Gaussian part at normalised inputs, in normalised output units."""
+        ...
+
+
+class ScoreEstimator(Protocol):
+    """Score of the joint log density of one output at M points; the caller vmaps over outputs."""
+
+    @property
+    def closed_form_gap(self) -> bool:
+        """Whether the Gaussian part enters as a covariance; otherwise the caller adds draws of it to the samples."""
+        ...
+
+    def __call__(
+        self, h: Float[Array, "L M"], samples: Float[Array, "N M"], covariance: Float[Array, "M M"]
+    ) -> Float[Array, "L M"]:
+        """Return the scores at L function values."""
+        ...
+
+
+class Setting(NamedTuple):
+    """The static half of a problem: what is called while a program is traced."""
+
+    prior: PriorProcess
+    score: ScoreEstimator
+    sample_inputs: Callable[[PRNGKeyArray, int], Float[Array, "n dx"]]
+
+
+class Inference(NamedTuple):
+    """An inference rule bound to a problem; every function is pure.
+
+    init(key) -> State; draw(key) -> Draws, random material for a stretch of steps that is not worth keeping;
+    step(key, State, Draws) -> (State, Info); predict(State, x in data units) -> Predictive in data units.
+    """
+
+    init: Callable[[PRNGKeyArray], Any]
+    draw: Callable[[PRNGKeyArray], Any]
+    step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
+    predict: Callable[[Any, Float[Array, "n dx"]], Predictive]
+
+
+class Method(Protocol):
+    """A method YAML: hyperparameters first, data last."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps to take."""
+        ...
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem; called while tracing, so that arrays stay arguments of the program."""
+        ...
+
+
+def padded_length(m: int) -> int:
+    """Return the length that m rows are padded to: powers of two from 32, so that few programs are compiled."""
+    return max(32, 1 << (m - 1).bit_length())
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Observation noise of the Gaussian likelihood, one standard deviation per output, in normalised units.
+
+    sigma = floor + softplus(rho), learned with prior log sigma ~ N(log sigma_init, prior_std^2), or fixed at sigma_init.
+
+    Args:
+        learn: learn it, or keep the initial value.
+        floor: smallest standard deviation when learned.
+        prior_std: standard deviation of log sigma under its prior.
+        least_init: sigma_init is the larger of the data's noise and this.
+    """
+
+    learn: bool = True
+    floor: float = 1e-3
+    prior_std: float = 1.0
+    least_init: float = 0.1
+
+    def init(self, sigma: Float[Array, " dy"]) -> Float[Array, " dy"]:
+        """Return rho for a standard deviation."""
+        # inverse softplus, written so that it does not overflow for large arguments
+        above = jnp.maximum(sigma - self.floor, 1e-6)
+        return above + jnp.log(-jnp.expm1(-above))
+
+    def std(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+        """Return sigma."""
+        return self.floor + jax.nn.softplus(rho)
+
+    def log_prior(self, rho: Float[Array, " dy"], sigma_init: Float[Array, " dy"]) -> Float[Array, ""]:
+        """Log density of log sigma, up to a constant."""
+        z = (jnp.log(self.std(rho)) - jnp.log(sigma_init)) / self.prior_std
+        return -0.5 * jnp.sum(z * z)
+
+
+def pad_rows(a: np.ndarray, length: int) -> np.ndarray:
+    """Repeat the last row until there are `length` rows; padding is never read as data, but must be simulable."""
+    return np.concatenate([a, np.repeat(a[-1:], length - len(a), axis=0)]) if len(a) < length else a

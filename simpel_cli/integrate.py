@@ -1,0 +1,37 @@
+"""Fixed-step integration of ordinary differential equations, one point at a time."""
+
+from collections.abc import Callable
+
+import jax
+from jaxtyping import Array, Float
+
+State = Float[Array, " ds"]
+
+
+def rk4(derivative: Callable[[State], State], x: State, dt: float, substeps: int) -> State:
+    """Integrate `dx/dt = derivative(x)` over `dt` with `substeps` classical Runge-Kutta steps.
+
+    The input of the system is held over `dt` (zero-order hold), so `derivative` takes the state alone.
+    The steps run in a scan: an unrolled integrator makes XLA recompute fused expressions.
+
+    Args:
+        derivative: right-hand side, state units per second.
+        x: state at the start, shape (ds,).
+        dt: length of the transition, s.
+        substeps: number of equal steps, at least 1.
+
+    Returns:
+        State after `dt`, shape (ds,); global error of order (dt/substeps)^4.
+
+    Reference: Kutta (1901).
+    """
+    h = dt / substeps
+
+    def step(x: State, _: None) -> tuple[State, None]:
+        k1 = derivative(x)
+        k2 = derivative(x + h / 2 * k1)
+        k3 = derivative(x + h / 2 * k2)
+        k4 = derivative(x + h * k3)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
+
+    return jax.lax.scan(step, x, None, length=substeps)[0]

@@ -1,0 +1,151 @@
+"""The one driver of everything that learns: an (init, draw, step) rule run in compiled stretches of fixed length.
+
+Every step's key is fold_in(key, absolute step), every stretch's draws come from fold_in(key, its first step), and
+checkpoints lie at the ends of stretches: a resumed run repeats bit for bit what an uninterrupted one does. Seeds are
+vmapped; problem arrays are arguments, so that runs of the same shapes share one compiled program.
+"""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError, Interrupted, NumericsError
+
+
+class Rule(Protocol):
+    """The part of an inference rule that the driver needs; see `simpel_cli.inference.Inference`."""
+
+    init: Callable[[PRNGKeyArray], Any]
+    draw: Callable[[PRNGKeyArray], Any]
+    step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
+
+
+class Stretch(NamedTuple):
+    """What the host sees after every stretch of steps."""
+
+    step: int  # steps taken so far
+    state: Any  # leaves (seeds, ...)
+    info: Any  # numpy leaves (seeds, steps of the stretch, ...)
+
+
+class Program(NamedTuple):
+    """Compiled `init` and `advance` of a rule."""
+
+    init: Callable[[Any, PRNGKeyArray], Any]
+    advance: Callable[[Any, PRNGKeyArray, Any, Int[Array, ""], Int[Array, ""]], tuple[Any, Any]]
+
+
+def program(bind: Callable[[Any], Rule], stretch: int) -> Program:
+    """Compile a rule.
+
+    Args:
+        bind: problem -> rule, called while tracing.
+        stretch: longest number of steps of one call.
+    """
+
+    @jax.jit
+    def init(problems: Any, keys: PRNGKeyArray) -> Any:
+        return jax.vmap(lambda problem, key: bind(problem).init(key))(problems, keys)
+
+    @partial(jax.jit, donate_argnums=2)
+    def advance(problems: Any, keys: PRNGKeyArray, states: Any, start: Any, length: Any) -> tuple[Any, Any]:
+        def one(problem: Any, key: PRNGKeyArray, state: Any) -> tuple[Any, Any]:
+            rule = bind(problem)
+            key_draw, key_step = jax.random.split(key)
+            draws = rule.draw(jax.random.fold_in(key_draw, start))
+
+            def body(i: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+                state, infos = carry
+                state, info = rule.step(jax.random.fold_in(key_step, start + i), state, draws)
+                return state, jax.tree.map(lambda buffer, value: buffer.at[i].set(value), infos, info)
+
+            shape = jax.eval_shape(rule.step, key_step, state, draws)[1]
+            infos = jax.tree.map(lambda s: jnp.zeros((stretch, *s.shape), s.dtype), shape)
+            # a loop of dynamic length: the last, shorter stretch needs no second program
+            return jax.lax.fori_loop(0, length, body, (state, infos))
+
+        return jax.vmap(one)(problems, keys, states)
+
+    return Program(init, advance)
+
+
+def train(
+    compiled: Program, problems: Any, keys: PRNGKeyArray, steps: int, stretch: int, *, state: Any = None, start: int = 0
+) -> Iterator[Stretch]:
+    """Run a rule for `steps` steps and yield after every stretch.
+
+    Args:
+        compiled: of `program`.
+        problems: problem arrays, leaves (seeds, ...).
+        keys: one per seed.
+        steps: total number of steps, counted from 0.
+        stretch: steps between two yields; the stretches of a resumed run must lie where the first run's lay.
+        state: where to go on; None: initialise.
+        start: steps already taken.
+
+    Raises:
+        NumericsError: a quantity of a step is not finite; names it and the step.
+        Interrupted: Ctrl-C or SIGTERM; the state was yielded before.
+    """
+    if start % stretch and start != steps:
+        raise ConfigError(f"the checkpoint lies at step {start}, which is no multiple of the stretch of {stretch} steps.")
+    state = compiled.init(problems, keys) if state is None else state
+    with interruption() as interrupted:
+        while start < steps:
+            length = min(stretch, steps - start)
+            arguments = (problems, keys, state, jnp.asarray(start, jnp.int32), jnp.asarray(length, jnp.int32))
+            state, info = compiled.advance(*arguments)
+            info = jax.tree.map(lambda a, n=length: np.asarray(a)[:, :n], info)
+            _refuse_non_finite(info, start)
+            start += length
+            yield Stretch(start, state, info)
+            if interrupted.is_set():
+                raise Interrupted(f"stopped at step {start} of {steps}; the state is saved.")
+
+
+@contextmanager
+def interruption() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C or SIGTERM sets; a second Ctrl-C acts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def note(number: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _refuse_non_finite(info: Any, start: int) -> None:
+    """Name the first step and quantity that is not finite."""
+    first: tuple[int, str, int] | None = None
+    for path, values in jax.tree_util.tree_leaves_with_path(info):
+        bad = ~np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1)
+        if bad.any():
+            step = int(bad.any(axis=0).argmax())
+            seed = int(bad[:, step].argmax())
+            if first is None or step < first[0]:
+                first = (step, jax.tree_util.keystr(path, simple=True), seed)
+    if first is not None:
+        step, name, seed = first
+        saved = f"the last good checkpoint is that of step {start}" if start else "there is no checkpoint yet"
+        raise NumericsError(
+            f"step {start + step + 1}: `{name}` is not finite (seed index {seed}); {saved}. "
+            "Try a smaller method.learning_rate, run.precision=float64, or narrower parameter ranges."
+        )

@@ -1,0 +1,202 @@
+"""Function-space Stein variational gradient descent (FSVGD), the inference rule of SimPEL.
+
+On a measurement set X of k points (a data batch and fresh points of the domain), particles move their function values
+h_l in R^(k dy) along
+
+    phi_i = 1/L sum_l [ K_li s_l + grad_{h_l} K_li ],    K_li = exp(-|h_l - h_i|^2 / (2 s^2))
+    s_l   = grad_{h_l} { (m/b) sum_batch log N(y; h_l(x), sigma^2) + log p(h_l^X) }
+
+and their weights along the vector-Jacobian product of phi_i. The score is that of the joint log posterior: the same
+prior weighs the same under every estimator.
+
+Reference: Wang, Ren, Zhu and Zhang (2019), Function space particle optimization for Bayesian neural networks, eq. 5;
+Liu and Wang (2016), Stein variational gradient descent, eq. 8; Treven et al., Simulation priors (SimPEL).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.inference import Inference, NoiseModel, Problem, Setting
+from simpel_cli.nets import MLP, Layers
+from simpel_cli.predictive import Predictive
+
+
+class State(NamedTuple):
+    """L networks, the noise parameter, and the optimiser's state of both."""
+
+    particles: Layers
+    noise: Float[Array, " dy"]
+    optimiser: optax.OptState
+
+
+class Draws(NamedTuple):
+    """Points of the domain and prior draws at them and at the training inputs, shared by a stretch of steps."""
+
+    x: Float[Array, "B dx"]
+    samples: Float[Array, "B dy N"]
+
+
+class Info(NamedTuple):
+    """What a step reports."""
+
+    loss: Float[Array, ""]
+    noise_std: Float[Array, " dy"]
+    mean_kernel: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class FSVGD:
+    """FSVGD with AdamW.
+
+    Args:
+        steps: number of SVGD steps.
+        particles: number of networks, L.
+        network: architecture.
+        learning_rate: of AdamW.
+        weight_decay: of AdamW, on network weights only.
+        batch: training points per step, at most; drawn with replacement.
+        fresh_points: points of the domain per step.
+        pool: points of the domain that a stretch of steps chooses from; a power of two.
+        bandwidth: s of the kernel on function values.
+        prior_weight: exponent of the prior; 1 is Bayes.
+        noise: observation noise.
+    """
+
+    steps: int = 5000
+    particles: int = 20
+    network: MLP = MLP()
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-3
+    batch: int = 8
+    fresh_points: int = 32
+    pool: int = 256
+    bandwidth: float = 2.0
+    prior_weight: float = 1.0
+    noise: NoiseModel = NoiseModel()
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "particles", "batch", "fresh_points", "pool"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        if self.pool & (self.pool - 1) or self.pool < self.fresh_points:
+            raise ConfigError(
+                f"method.pool: got {self.pool}; it must be a power of two and at least fresh_points ({self.fresh_points})."
+            )
+        for name in ("learning_rate", "bandwidth"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be positive.")
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
+        to_normalised = problem.normaliser
+        dtype = problem.x.dtype
+        x_train = to_normalised.x(problem.x)
+        n_rows, dim_x = problem.x.shape
+        dim_y = problem.y.shape[1]
+        optimiser = optax.adamw(self.learning_rate, weight_decay=self.weight_decay, mask=(True, False))
+
+        def init(key: PRNGKeyArray) -> State:
+            keys = jax.random.split(key, self.particles)
+            particles = jax.vmap(lambda k: self.network.init(k, dim_x, dim_y, dtype))(keys)
+            noise = self.noise.init(problem.noise_init)
+            return State(particles, noise, optimiser.init((particles, noise)))
+
+        def draw(key: PRNGKeyArray) -> Draws:
+            if problem.bank is not None:
+                x, samples = problem.bank
+            else:
+                key_x, key_phi = jax.random.split(key)
+                fresh = setting.sample_inputs(key_x, self.pool)
+                x = jnp.concatenate([problem.x, fresh])
+                samples = jnp.moveaxis(setting.prior.simulate(key_phi, x, setting.prior.draws), 0, -1)
+            scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
+            return Draws(to_normalised.x(x), scaled)
+
+        def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Int[Array, " k"]]:
+            """Rows of the batch, and rows of the bank: the batch and distinct fresh points."""
+            key_batch, key_offset, key_stride = jax.random.split(key, 3)
+            batch = jax.random.randint(key_batch, (min(self.batch, n_rows),), 0, problem.m)
+            # an odd stride visits a power of two of rows without repeats: distinct points without a sort
+            offset = jax.random.randint(key_offset, (), 0, self.pool)
+            stride = 2 * jax.random.randint(key_stride, (), 0, max(self.pool // 2, 1)) + 1
+            fresh = n_rows + (offset + stride * jnp.arange(self.fresh_points)) % self.pool
+            return batch, jnp.concatenate([batch, fresh])
+
+        def step(key: PRNGKeyArray, state: State, draws: Draws) -> tuple[State, Info]:
+            key_points, key_gap = jax.random.split(key)
+            batch, rows = measurement_set(key_points)
+            b = batch.shape[0]
+            x, y = draws.x[rows], problem.y[batch]
+            h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
+
+            weight = problem.m.astype(dtype) / b
+            log_likelihood, (score_data, score_noise) = jax.value_and_grad(
+                lambda h, rho: _log_likelihood(h, self.noise.std(rho), y), argnums=(0, 1)
+            )(h[:, :b], state.noise)
+            score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
+            score = score.at[:, :b].add(weight * score_data)
+            velocity, mean_kernel = stein_velocity(h, score, self.bandwidth)
+
+            (ascent,) = pull_back(velocity)
+            # the noise is shared by the particles: its gradient is averaged over them
+            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init)
+            ascent_noise = weight * score_noise / self.particles + noise_prior if self.noise.learn else 0 * state.noise
+            descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
+            with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
+                updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
+            particles, noise = optax.apply_updates((state.particles, state.noise), updates)
+            info = Info(-log_likelihood / (b * self.particles), self.noise.std(state.noise), mean_kernel)
+            return State(particles, noise, opt_state), info
+
+        def prior_score(
+            key: PRNGKeyArray, h: Float[Array, "L k dy"], samples: Float[Array, "k dy N"], x: Float[Array, "k dx"]
+        ) -> Float[Array, "L k dy"]:
+            covariance = setting.prior.covariance(x, problem.gap_scale)
+            if not setting.score.closed_form_gap:
+                factor = jnp.linalg.cholesky(covariance.astype(jnp.float64)).astype(dtype)
+                white = jax.random.normal(key, samples.shape, dtype)
+                samples = samples + jnp.einsum("dkj,jdn->kdn", factor, white)
+            estimate = jax.vmap(lambda h, s, c: setting.score(h, s.T, c), in_axes=(2, 1, 0), out_axes=2)
+            return estimate(h, samples, covariance)
+
+        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
+            h = self.network.apply_all(state.particles, to_normalised.x(x))
+            y_std = to_normalised.y_std
+            return Predictive(
+                h * y_std[None, None] + to_normalised.y_mean[None, None], self.noise.std(state.noise) * y_std
+            )
+
+        return Inference(init, draw, step, predict)
+
+
+def _log_likelihood(
+    h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"]
+) -> Float[Array, ""]:
+    """Sum over particles, points and outputs of log N(y; h, sigma^2), up to a constant."""
+    z = (y[None] - h) / sigma[None, None]
+    return jnp.sum(-0.5 * z * z - jnp.log(sigma)[None, None])
+
+
+def stein_velocity(
+    h: Float[Array, "L *d"], score: Float[Array, "L *d"], bandwidth: float
+) -> tuple[Float[Array, "L *d"], Float[Array, ""]]:
+    """Return phi_i = 1/L sum_l [K_li s_l + grad_{h_l} K_li] and the mean off-diagonal K.
+
+    1/L multiplies both terms: scaled apart, N(0, 1) comes out several times too narrow.
+
+    Reference: Liu and Wang (2016), eq. 8.
+    """
+    n = h.shape[0]
+    flat, drive = h.reshape(n, -1), score.reshape(n, -1)
+    difference = flat[:, None, :] - flat[None, :, :]
+    kernel = jnp.exp(-0.5 * jnp.sum(difference**2, axis=-1) / bandwidth**2)
+    # sum_l grad_{h_l} K_li = sum_l K_li (h_i - h_l) / s^2
+    repulsion = (jnp.sum(kernel, axis=0)[:, None] * flat - kernel.T @ flat) / bandwidth**2
+    off_diagonal = (jnp.sum(kernel) - n) / max(n * (n - 1), 1)
+    return ((kernel.T @ drive + repulsion) / n).reshape(h.shape), off_diagonal

@@ -1,0 +1,55 @@
+"""Multilayer perceptrons, written for one particle and one input; vmap at the boundary."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Layers = tuple[tuple[Float[Array, "fan_in fan_out"], Float[Array, " fan_out"]], ...]
+
+
+@dataclass(frozen=True)
+class MLP:
+    """Fully connected network with leaky ReLU.
+
+    Hidden kernels are He-uniform, hidden biases U(+-1/sqrt(fan_in)), the output kernel LeCun-normal, the output bias 0.
+
+    Args:
+        hidden: widths of the hidden layers.
+        negative_slope: slope of the leaky ReLU below zero.
+    """
+
+    hidden: tuple[int, ...] = (64, 64, 64)
+    negative_slope: float = 0.01
+
+    def init(self, key: PRNGKeyArray, dim_in: int, dim_out: int, dtype: jnp.dtype) -> Layers:
+        """Draw the weights of one network.
+
+        Reference: He et al. (2015) for the hidden kernels, LeCun et al. (1998) for the output kernel.
+        """
+        sizes = (dim_in, *self.hidden, dim_out)
+        keys = jax.random.split(key, 2 * (len(sizes) - 1))
+        layers = []
+        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+            if i < len(self.hidden):
+                bound = (6.0 / fan_in) ** 0.5
+                kernel = jax.random.uniform(keys[2 * i], (fan_in, fan_out), dtype, -bound, bound)
+                bias_bound = fan_in**-0.5
+                bias = jax.random.uniform(keys[2 * i + 1], (fan_out,), dtype, -bias_bound, bias_bound)
+            else:
+                kernel = jax.random.normal(keys[2 * i], (fan_in, fan_out), dtype) * fan_in**-0.5
+                bias = jnp.zeros((fan_out,), dtype)
+            layers.append((kernel, bias))
+        return tuple(layers)
+
+    def apply(self, layers: Layers, x: Float[Array, "n dx"]) -> Float[Array, "n dy"]:
+        """Evaluate one network at n inputs."""
+        for kernel, bias in layers[:-1]:
+            x = jax.nn.leaky_relu(x @ kernel + bias[None], self.negative_slope)
+        kernel, bias = layers[-1]
+        return x @ kernel + bias[None]
+
+    def apply_all(self, particles: Layers, x: Float[Array, "n dx"]) -> Float[Array, "L n dy"]:
+        """Evaluate L networks (leaves with a leading axis L) at the same n inputs."""
+        return jax.vmap(self.apply, in_axes=(0, None))(particles, x)

@@ -1,0 +1,173 @@
+"""Priors over functions: a simulator with uncertain parameters plus a Gaussian process for what it lacks.
+
+    h_i(X) = g_i(X, phi) + h~_i(X),   phi ~ p(phi),   h~_i ~ GP(0, kappa_i^2 rho(|x - x'|/l) + w)
+
+The simulator part is sampled, the Gaussian part is known in closed form. `w` is the variance of a small white model
+error that keeps the joint law of many points non-degenerate; it belongs to the prior, so every score estimator sees it.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from simulators.model import Quantity
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.gp import Kernel, SquaredExponential, gram
+from simpel_cli.transition import OneStep, Transition
+
+
+@dataclass(frozen=True)
+class GapGP:
+    """Gaussian process for the gap between simulator and reality.
+
+    Args:
+        kernel: correlation function.
+        lengthscale: in normalised inputs (unit variance on the domain), or in data units; null = 2 sqrt(dx) normalised.
+        lengthscale_units: `normalised` or `raw`.
+        scale: kappa, the standard deviation per output. `declared` takes `gap:` of the simulator and `auto` for what it
+            leaves out; `auto` maximises the marginal likelihood of the training transitions; a number is a fraction of
+            the outputs' normalising standard deviation.
+    """
+
+    kernel: Kernel = SquaredExponential()
+    lengthscale: float | None = None
+    lengthscale_units: str = "normalised"
+    scale: float | str = "declared"
+
+    def __post_init__(self) -> None:
+        if self.lengthscale_units not in ("normalised", "raw"):
+            raise ConfigError(
+                f"prior.gap.lengthscale_units: got {self.lengthscale_units!r}; allowed are normalised and raw."
+            )
+        if self.lengthscale is not None and not self.lengthscale > 0:
+            raise ConfigError(f"prior.gap.lengthscale: got {self.lengthscale}; it must be positive (or null).")
+        if isinstance(self.scale, str) and self.scale not in ("declared", "auto"):
+            raise ConfigError(f"prior.gap.scale: got {self.scale!r}; allowed are declared, auto and a number >= 0.")
+        if not isinstance(self.scale, str) and not self.scale >= 0:
+            raise ConfigError(f"prior.gap.scale: got {self.scale}; a number must be >= 0 (0 switches the gap off).")
+
+
+class FunctionPrior(NamedTuple):
+    """A prior bound to a system; see `simpel_cli.inference.PriorProcess`.
+
+    Args:
+        draws: number of simulator draws, N.
+        white_variance: variance of the white model error, normalised output units.
+        kernel: correlation of the gap; None: no gap.
+        input_scale: factor from normalised inputs to units of the lengthscale, shape (dx,).
+        params: uncertain parameters of the simulator.
+        step: the simulator's one-step map; None: no simulator part (zero).
+        dim_y: number of outputs.
+    """
+
+    draws: int
+    white_variance: float
+    kernel: Kernel | None
+    input_scale: np.ndarray
+    params: tuple[Quantity, ...]
+    step: OneStep | None
+    dim_y: int
+
+    def simulate(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
+        """Draw n parameter vectors and run the simulator of each at every input (data units)."""
+        if self.step is None:
+            return jnp.zeros((n, x.shape[0], self.dim_y), x.dtype)
+        phi = sample_parameters(key, self.params, n, x.dtype)
+        return jax.vmap(lambda p: jax.vmap(self.step, in_axes=(0, None))(x, p))(phi)
+
+    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array, " dy"]) -> Float[Array, "dy M M"]:
+        """Covariance of the Gaussian part; the correlation matrix is shared by the outputs."""
+        white = self.white_variance * jnp.eye(x.shape[0], dtype=x.dtype)
+        if self.kernel is None:
+            return jnp.broadcast_to(white[None], (self.dim_y, *white.shape))
+        scaled = x * jnp.asarray(self.input_scale, x.dtype)[None]
+        return (scale**2)[:, None, None] * gram(self.kernel, scaled, scaled)[None] + white[None]
+
+
+@dataclass(frozen=True)
+class SimulatorPrior:
+    """Simulator with parameter ranges, plus a gap GP.
+
+    Args:
+        gap: what the simulator lacks; null = nothing (only the simulator).
+        draws: number of parameter draws that the score is estimated from, N.
+        white_variance: variance of the white model error, normalised output units; relative to the unit variance that
+            outputs have under the prior.
+    """
+
+    gap: GapGP | None = GapGP()
+    draws: int = 1028
+    white_variance: float = 1e-4
+
+    uses_simulator = True  # not a field: the targets' normaliser and `fit` ask for it
+
+    def __post_init__(self) -> None:
+        if self.draws < 2:
+            raise ConfigError(f"prior.draws: got {self.draws}; a covariance needs at least 2.")
+        if not self.white_variance > 0:
+            raise ConfigError(f"prior.white_variance: got {self.white_variance}; it must be positive.")
+
+    def bind(self, system: Transition | None, dim_x: int, dim_y: int, x_std: np.ndarray) -> FunctionPrior:
+        """Bind to a simulator (None: it can only be queried, and its draws come as a bank)."""
+        step, params = (system.step, system.params) if system is not None else (None, ())
+        kernel, input_scale = None, np.ones(dim_x)
+        if self.gap is not None:
+            kernel, input_scale = self.gap.kernel, _input_scale(self.gap, x_std)
+        return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, dim_y)
+
+
+@dataclass(frozen=True)
+class GPPrior:
+    """A Gaussian process without a simulator, on normalised inputs and outputs.
+
+    Args:
+        kernel: correlation function.
+        lengthscale: in normalised inputs.
+        scale: standard deviation in normalised outputs.
+        white_variance: variance of the white model error, normalised output units.
+    """
+
+    kernel: Kernel = SquaredExponential()
+    lengthscale: float = 0.4
+    scale: float = 1.0
+    white_variance: float = 1e-3
+
+    uses_simulator = False
+
+    @property
+    def gap(self) -> GapGP:
+        """The process itself, as the Gaussian part of a prior whose simulator part is zero."""
+        return GapGP(self.kernel, self.lengthscale, "normalised", self.scale)
+
+    def bind(self, system: Transition | None, dim_x: int, dim_y: int, x_std: np.ndarray) -> FunctionPrior:
+        """Bind to the dimensions of a system; its simulator is not used."""
+        # two zero draws: mean and covariance of the (absent) simulator part are exactly zero
+        return FunctionPrior(2, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, dim_y)
+
+
+def _input_scale(gap: GapGP, x_std: np.ndarray) -> np.ndarray:
+    lengthscale = gap.lengthscale if gap.lengthscale is not None else 2.0 * len(x_std) ** 0.5
+    return (x_std if gap.lengthscale_units == "raw" else np.ones_like(x_std)) / lengthscale
+
+
+def sample_parameters(
+    key: PRNGKeyArray, params: tuple[Quantity, ...], n: int, dtype: jnp.dtype
+) -> Float[Array, "n dp"]:
+    """Draw n parameter vectors from p(phi).
+
+    Uniform on the range; for normal and lognormal priors the range is mean +- 2 standard deviations (of the log).
+    """
+    low, high = (jnp.asarray([getattr(q, end) for q in params], dtype) for end in ("low", "high"))
+    log = np.array([q.prior == "lognormal" for q in params], bool)
+    gaussian = np.array([q.prior != "uniform" for q in params], bool)
+    low, high = (jnp.where(log, jnp.log(jnp.where(log, b, 1.0)), b) for b in (low, high))
+    key_uniform, key_normal = jax.random.split(key)
+    uniform = jax.random.uniform(key_uniform, (n, len(params)), dtype)
+    normal = jax.random.normal(key_normal, (n, len(params)), dtype)
+    middle, width = ((low + high) / 2)[None], (high - low)[None]
+    draws = jnp.where(gaussian[None], middle + width / 4 * normal, low[None] + width * uniform)
+    return jnp.where(log[None], jnp.exp(jnp.where(log[None], draws, 0.0)), draws)

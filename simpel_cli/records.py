@@ -1,0 +1,157 @@
+"""Files of a run: metric rows as Parquet with one fixed schema, checkpoints as safetensors. Writes are atomic.
+
+A file appears under its name only when it is complete (temporary name in the same folder, fsync, rename), so a kill
+leaves the old one. Nothing that is loaded is ever unpickled.
+"""
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.errors import ConfigError
+
+COLUMNS = (
+    ("run", "string"), ("command", "string"), ("experiment", "string"), ("method", "string"), ("sim", "string"),
+    ("data", "string"), ("n_train", "int32"), ("seed", "int32"), ("step", "int64"), ("split", "string"),
+    ("metric", "string"), ("output", "string"), ("unit", "string"), ("value", "float64"),
+)  # fmt: skip
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path; on success it is fsynced and takes the place of `path`, on failure it is removed."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes 0600, which hides runs from a group on a cluster
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> None:
+    """Write columns (name -> sequence) as Parquet, atomically."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with replacing(path) as temporary:
+        pq.write_table(pa.Table.from_pydict(columns), temporary)
+
+
+class MetricStream:
+    """Append-only stream of metric rows that survives SIGKILL, turned into `metrics.parquet` by `close`.
+
+    Rows go to `metrics.jsonl`, flushed per write. On resume, rows after the checkpoint's step are cut off, and what a
+    kill left half-written is dropped.
+
+    Args:
+        directory: the run directory.
+        constants: values of the columns that are the same in every row of the run.
+    """
+
+    def __init__(self, directory: Path, constants: dict[str, Any], *, resume_at: int | None = None) -> None:
+        self.directory, self.constants = directory, constants
+        self.path = directory / "metrics.jsonl"
+        kept = [] if resume_at is None else [r for r in self._read() if r["split"] == "train" and r["step"] <= resume_at]
+        write_text(self.path, "".join(json.dumps(r) + "\n" for r in kept))
+        self._file = self.path.open("a")
+
+    def add(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Append rows: any of seed, step, split, metric, output, unit, value."""
+        for row in rows:
+            self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+
+    def close(self) -> Path:
+        """Write `metrics.parquet` from the stream and remove the stream."""
+        self._file.close()
+        path = write_metrics(self.directory / "metrics.parquet", self._read(), self.constants)
+        self.path.unlink()
+        return path
+
+    def _read(self) -> list[dict[str, Any]]:
+        rows = []
+        with contextlib.suppress(FileNotFoundError):
+            for line in self.path.read_text().splitlines():
+                with contextlib.suppress(json.JSONDecodeError):  # the last line of a killed run may be half-written
+                    rows.append(json.loads(line))
+        return rows
+
+
+def write_metrics(path: Path, rows: list[dict[str, Any]], constants: dict[str, Any]) -> Path:
+    """Write metric rows as tidy Parquet with the fixed schema of every verb."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64()}
+    schema = pa.schema([(name, types[kind]) for name, kind in COLUMNS])
+    table = pa.table({n: pa.array([(constants | r).get(n) for r in rows], types[k]) for n, k in COLUMNS}, schema=schema)
+    with replacing(path) as temporary:
+        pq.write_table(table, temporary)
+    return path
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Read metric rows.
+
+    Raises:
+        ConfigError: the file is missing or damaged.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path).to_pylist()
+    except (OSError, pa.ArrowException) as error:
+        raise ConfigError(f"{path}: not readable as metrics ({str(error).splitlines()[0]}).") from error
+
+
+def save_checkpoint(directory: Path, leaves: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
+    """Write `state.safetensors` and the JSON facts inside its header, as one atomic file."""
+    from safetensors.numpy import save_file
+
+    directory.mkdir(exist_ok=True)
+    for stale in directory.glob(".*.tmp"):  # what a kill left of an earlier write
+        stale.unlink(missing_ok=True)
+    with replacing(directory / "state.safetensors") as temporary:
+        contiguous = {name: np.ascontiguousarray(a) for name, a in leaves.items()}
+        save_file(contiguous, temporary, metadata={"simpel": json.dumps(facts)})
+
+
+def load_checkpoint(directory: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read a checkpoint's arrays and facts.
+
+    Raises:
+        ConfigError: missing, truncated or not a checkpoint of simpel.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = directory / "state.safetensors"
+    if not path.is_file():
+        raise ConfigError(f"{path}: no checkpoint. The run stopped before its first one; start it again.")
+    try:
+        with safe_open(path, framework="np") as file:
+            facts = json.loads((file.metadata() or {})["simpel"])
+            return {name: file.get_tensor(name) for name in file.keys()}, facts  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: damaged or not a checkpoint of simpel ({type(error).__name__}: {error}). Restore it or fit again."
+        ) from error

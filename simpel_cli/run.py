@@ -1,0 +1,227 @@
+"""What surrounds a computation: settings, device and precision, run directory, named random streams, manifest."""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import zlib
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from simpel_cli.errors import ConfigError, DataError, Interrupted, NumericsError, SimpelError
+from simpel_cli.records import write_text
+
+if TYPE_CHECKING:
+    import jax
+    from jaxtyping import PRNGKeyArray
+
+PACKAGES = ("simpel", "jax", "jaxlib", "optax", "hydra-core", "omegaconf", "casadi", "mujoco", "numpy", "pyarrow")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The `run:` group of every verb.
+
+    Args:
+        name: name of the run in metrics and in the run directory's path.
+        seed: random seed of the model; seeds of several runs in one program count up from it.
+        seeds: number of seeds that are trained at once.
+        precision: `float32` or `float64` for learning (priors' factorisations always run in float64).
+        device: `auto`, `cpu` or `gpu`.
+        cache: keep compiled programs in the user's cache directory.
+        quiet: print errors only.
+        plugins: packages of the user's that `_target_` and callables may name.
+    """
+
+    name: str = "run"
+    seed: int = 0
+    seeds: int = 1
+    precision: str = "float32"
+    device: str = "auto"
+    cache: bool = True
+    quiet: bool = False
+    plugins: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.precision not in ("float32", "float64"):
+            raise ConfigError(f"run.precision: got {self.precision!r}; allowed are float32 and float64.")
+        if self.device not in ("auto", "cpu", "gpu"):
+            raise ConfigError(f"run.device: got {self.device!r}; allowed are auto, cpu and gpu.")
+        if not 1 <= self.seeds <= 1000:
+            raise ConfigError(f"run.seeds: got {self.seeds}; allowed are 1 to 1000.")
+        if not 0 <= self.seed < 2**31:
+            raise ConfigError(f"run.seed: got {self.seed}; allowed are 0 to 2147483647.")
+
+    @property
+    def all_seeds(self) -> list[int]:
+        """The seeds of this run."""
+        return list(range(self.seed, self.seed + self.seeds))
+
+
+def configure(settings: Settings) -> "jax.Device":
+    """Set up JAX for this process: float64 available, device, persistent compilation cache.
+
+    Returns:
+        The device that computations run on.
+
+    Raises:
+        ConfigError: `run.device=gpu` and JAX sees none.
+    """
+    import jax
+
+    # float64 is enabled for factorisations and discovery; learning states its dtype and stays in run.precision
+    jax.config.update("jax_enable_x64", True)
+    if settings.cache:
+        jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if settings.device == "auto":
+        return jax.devices()[0]
+    try:
+        device = jax.devices(settings.device)[0]
+    except RuntimeError as error:
+        raise ConfigError(
+            f"run.device: got {settings.device}; JAX sees {jax.default_backend()} only. "
+            "Use run.device=auto, or install jax[cuda13]."
+        ) from error
+    jax.config.update("jax_default_device", device)
+    return device
+
+
+def cache_directory() -> Path:
+    """Return the user's cache directory for simpel ($XDG_CACHE_HOME/simpel or ~/.cache/simpel)."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return (Path(root) if root else Path.home() / ".cache") / "simpel"
+    except RuntimeError as error:  # no home directory
+        raise ConfigError("no home directory: set XDG_CACHE_HOME, or switch the cache off with run.cache=false.") from error
+
+
+def stream(seed: int, name: str) -> "PRNGKeyArray":
+    """Return the random stream `name` of an integer seed; streams of different names are independent."""
+    import jax
+
+    return jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode()))
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+STATUS = {Interrupted: "interrupted", NumericsError: "failed", DataError: "failed", ConfigError: "failed"}
+
+
+@dataclass
+class Manifest:
+    """`manifest.json` of a run directory: what ran, on what, with which inputs, and how it ended.
+
+    Args:
+        directory: the run directory.
+        command: verb.
+        settings: of the run.
+    """
+
+    directory: Path
+    command: str
+    settings: Settings
+    inputs: dict[str, str] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+    started: float = field(default_factory=time.monotonic)
+
+    def write(self, status: str, error: str | None = None) -> None:
+        """Write the manifest with a status: running, done, interrupted or failed."""
+        record = {
+            "command": self.command,
+            "command_line": " ".join(["simpel", *sys.argv[1:]]),
+            "status": status,
+            "error": error,
+            "seed": self.settings.seed,
+            "seeds": self.settings.seeds,
+            "wall_seconds": round(time.monotonic() - self.started, 3),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "git_commit": _git_commit(),
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "versions": {name: _version(name) for name in PACKAGES},
+            "inputs_sha256": self.inputs,
+            **self.facts,
+        }
+        write_text(self.directory / "manifest.json", json.dumps(record, indent=1, default=str))
+
+    def add_inputs(self, files: "tuple[Path, ...]") -> None:
+        """Record the SHA-256 of input files."""
+        self.inputs |= {str(f): sha256(f) for f in files}
+
+    def __enter__(self) -> "Manifest":
+        self.write("running")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if error is None:
+            self.write("done")
+        elif isinstance(error, Interrupted | KeyboardInterrupt):
+            self.write("interrupted", str(error))
+        else:
+            text = str(error) if isinstance(error, SimpelError) else f"{type(error).__name__}: {error}"
+            self.write("failed", text)
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """Read `manifest.json` of a run directory.
+
+    Raises:
+        ConfigError: it is missing or not readable, so the directory is not a run.
+    """
+    path = directory / "manifest.json"
+    try:
+        record = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{directory}: not a run directory (it has no manifest.json). Run directories lie under runs/."
+        ) from error
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ConfigError(f"{path}: not readable ({error}).") from error
+    if not isinstance(record, dict) or "command" not in record:
+        raise ConfigError(f"{path}: not a manifest of simpel (no key `command`).")
+    return record
+
+
+def make_directory(path: Path) -> Path:
+    """Create a run directory and prove that it can be written.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(
+            f"hydra.run.dir: cannot write to {path} ({error.strerror}). Choose another place: hydra.run.dir=DIR."
+        ) from error
+    return path
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _git_commit() -> str | None:
+    try:
+        answer = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() or None
