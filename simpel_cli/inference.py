@@ -27,6 +27,10 @@ class Normaliser(NamedTuple):
         """Normalise network inputs."""
         return (x - self.x_mean[None]) / self.x_std[None]
 
+    def y_to_data(self, h: Float[Array, "L n dy"]) -> Float[Array, "L n dy"]:
+        """Bring normalised function values to data units."""
+        return h * self.y_std[None, None] + self.y_mean[None, None]
+
 
 class Bank(NamedTuple):
     """Prior draws at fixed points, for simulators that can only be queried: (B, dy, N) at inputs (B, dx).
@@ -98,13 +102,15 @@ class Inference(NamedTuple):
     """An inference rule bound to a problem; every function is pure.
 
     init(key) -> State; draw(key) -> Draws, random material for a stretch of steps that is not worth keeping;
-    step(key, State, Draws) -> (State, Info); predict(State, x in data units) -> Predictive in data units.
+    step(key, State, Draws) -> (State, Info); predict(State, x in data units) -> Predictive in data units;
+    members(State, x of every particle) -> targets of every particle, for roll-outs along each particle's own path.
     """
 
     init: Callable[[PRNGKeyArray], Any]
     draw: Callable[[PRNGKeyArray], Any]
     step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
     predict: Callable[[Any, Float[Array, "n dx"]], Predictive]
+    members: Callable[[Any, Float[Array, "L n dx"]], Float[Array, "L n dy"]]
 
 
 class Method(Protocol):

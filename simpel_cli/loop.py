@@ -7,15 +7,15 @@ vmapped; problem arrays are arguments, so that runs of the same shapes share one
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
 
@@ -23,9 +23,20 @@ from simpel_cli.errors import ConfigError, Interrupted, NumericsError
 class Rule(Protocol):
     """The part of an inference rule that the driver needs; see `simpel_cli.inference.Inference`."""
 
-    init: Callable[[PRNGKeyArray], Any]
-    draw: Callable[[PRNGKeyArray], Any]
-    step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
+    @property
+    def init(self) -> Callable[[PRNGKeyArray], Any]:
+        """Key to state."""
+        ...
+
+    @property
+    def draw(self) -> Callable[[PRNGKeyArray], Any]:
+        """Key to the random material of a stretch."""
+        ...
+
+    @property
+    def step(self) -> Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]:
+        """Key, state and draws to the next state and what to report."""
+        ...
 
 
 class Stretch(NamedTuple):
@@ -37,26 +48,30 @@ class Stretch(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Compiled `init` and `advance` of a rule."""
+    """A rule compiled for the shapes of its problems."""
 
     init: Callable[[Any, PRNGKeyArray], Any]
-    advance: Callable[[Any, PRNGKeyArray, Any, Int[Array, ""], Int[Array, ""]], tuple[Any, Any]]
+    advance: Callable[[Any, PRNGKeyArray, Any, Array, Array], tuple[Any, Any]]
+    problems: Any
+    keys: PRNGKeyArray
+    stretch: int
+    compile_seconds: float
 
 
-def program(bind: Callable[[Any], Rule], stretch: int) -> Program:
-    """Compile a rule.
+def compiled(bind: Callable[[Any], Rule], problems: Any, keys: PRNGKeyArray, stretch: int) -> Program:
+    """Compile a rule ahead of time.
 
     Args:
         bind: problem -> rule, called while tracing.
+        problems: problem arrays, leaves (seeds, ...).
+        keys: one per seed.
         stretch: longest number of steps of one call.
     """
 
-    @jax.jit
     def init(problems: Any, keys: PRNGKeyArray) -> Any:
         return jax.vmap(lambda problem, key: bind(problem).init(key))(problems, keys)
 
-    @partial(jax.jit, donate_argnums=2)
-    def advance(problems: Any, keys: PRNGKeyArray, states: Any, start: Any, length: Any) -> tuple[Any, Any]:
+    def advance(problems: Any, keys: PRNGKeyArray, states: Any, start: Array, length: Array) -> tuple[Any, Any]:
         def one(problem: Any, key: PRNGKeyArray, state: Any) -> tuple[Any, Any]:
             rule = bind(problem)
             key_draw, key_step = jax.random.split(key)
@@ -70,24 +85,29 @@ def program(bind: Callable[[Any], Rule], stretch: int) -> Program:
             shape = jax.eval_shape(rule.step, key_step, state, draws)[1]
             infos = jax.tree.map(lambda s: jnp.zeros((stretch, *s.shape), s.dtype), shape)
             # a loop of dynamic length: the last, shorter stretch needs no second program
-            return jax.lax.fori_loop(0, length, body, (state, infos))
+            return jax.lax.fori_loop(jnp.int32(0), length, body, (state, infos))
 
         return jax.vmap(one)(problems, keys, states)
 
-    return Program(init, advance)
+    began = time.perf_counter()
+    count = jnp.int32(0)
+    shapes = jax.eval_shape(init, problems, keys)
+    # the old state's memory is given to the new one
+    ready = jax.jit(advance, donate_argnums=2).lower(problems, keys, shapes, count, count).compile()
+    return Program(jax.jit(init), ready, problems, keys, stretch, time.perf_counter() - began)
 
 
-def train(
-    compiled: Program, problems: Any, keys: PRNGKeyArray, steps: int, stretch: int, *, state: Any = None, start: int = 0
-) -> Iterator[Stretch]:
+def state_shape(program: Program) -> Any:
+    """Return shapes and dtypes of the state, as a tree."""
+    return jax.eval_shape(program.init, program.problems, program.keys)
+
+
+def train(program: Program, steps: int, *, state: Any = None, start: int = 0) -> Iterator[Stretch]:
     """Run a rule for `steps` steps and yield after every stretch.
 
     Args:
-        compiled: of `program`.
-        problems: problem arrays, leaves (seeds, ...).
-        keys: one per seed.
+        program: of `compiled`.
         steps: total number of steps, counted from 0.
-        stretch: steps between two yields; the stretches of a resumed run must lie where the first run's lay.
         state: where to go on; None: initialise.
         start: steps already taken.
 
@@ -95,19 +115,18 @@ def train(
         NumericsError: a quantity of a step is not finite; names it and the step.
         Interrupted: Ctrl-C or SIGTERM; the state was yielded before.
     """
-    if start % stretch and start != steps:
-        raise ConfigError(f"the checkpoint lies at step {start}, which is no multiple of the stretch of {stretch} steps.")
-    state = compiled.init(problems, keys) if state is None else state
+    if start % program.stretch and start != steps:
+        raise ConfigError(f"the checkpoint lies at step {start}, no multiple of {program.stretch} steps; fit again.")
+    state = program.init(program.problems, program.keys) if state is None else state
     with interruption() as interrupted:
         while start < steps:
-            length = min(stretch, steps - start)
-            arguments = (problems, keys, state, jnp.asarray(start, jnp.int32), jnp.asarray(length, jnp.int32))
-            state, info = compiled.advance(*arguments)
+            length = min(program.stretch, steps - start)
+            state, info = program.advance(program.problems, program.keys, state, jnp.int32(start), jnp.int32(length))
             info = jax.tree.map(lambda a, n=length: np.asarray(a)[:, :n], info)
             _refuse_non_finite(info, start)
             start += length
             yield Stretch(start, state, info)
-            if interrupted.is_set():
+            if interrupted.is_set() and start < steps:
                 raise Interrupted(f"stopped at step {start} of {steps}; the state is saved.")
 
 

@@ -167,12 +167,12 @@ class FSVGD:
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             h = self.network.apply_all(state.particles, to_normalised.x(x))
-            y_std = to_normalised.y_std
-            return Predictive(
-                h * y_std[None, None] + to_normalised.y_mean[None, None], self.noise.std(state.noise) * y_std
-            )
+            return Predictive(to_normalised.y_to_data(h), self.noise.std(state.noise) * to_normalised.y_std)
 
-        return Inference(init, draw, step, predict)
+        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
+            return to_normalised.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(to_normalised.x)(x)))
+
+        return Inference(init, draw, step, predict, members)
 
 
 def _log_likelihood(

@@ -1,0 +1,50 @@
+"""`simpel evaluate RUN_DIR [data=...]`: rebuild a posterior from configuration and checkpoint, judge it."""
+
+from pathlib import Path
+
+from simpel_cli.commands.fit import checkpointed_state
+from simpel_cli.commands.judge import judge
+from simpel_cli.commands.show import publish
+from simpel_cli.commands.study import open_study, posteriors, prepare, resolved, settings_of
+from simpel_cli.config import Job, dump, load
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError
+from simpel_cli.records import write_metrics, write_text
+from simpel_cli.run import Manifest, make_directory, read_manifest
+
+
+def evaluate(job: Job) -> None:
+    """Judge the run `run_dir` on its own test split, or on the measurements that `data=` names.
+
+    Training data, seeds and method are the run's; `data=`, `evaluation=` and `run.quiet` may differ.
+    """
+    run = Path(job.config["run_dir"])
+    record = read_manifest(run)
+    if record["command"] != "fit":
+        raise ConfigError(f"{run}: made by `simpel {record['command']}`; evaluate takes the directory of a fit.")
+    trained = load(run / "config.yaml")
+    directory = make_directory(job.directory)
+    own = resolved(job)
+    config = trained | {k: own[k] for k in ("evaluation",) if own.get(k)}
+    config["run"] = trained["run"] | {k: own["run"][k] for k in ("quiet", "device", "cache") if k in (own.get("run") or {})}
+    write_text(directory / "config.yaml", dump(config | ({"judged_on": own["data"]} if own.get("data") else {})))
+    with Manifest(directory, "evaluate", settings_of(config)) as manifest:
+        study = open_study(config, run)
+        fitted = prepare(study)
+        step, state = checkpointed_state(run, fitted)
+        judged_on = study
+        if own.get("data"):
+            choices = trained["choices"] | {"data": own["choices"].get("data", "")}
+            judged_on = open_study(config | {"data": own["data"] | {"n_train": None}, "choices": choices}, job.data_folder)
+            if judged_on.system.encoding != study.system.encoding:
+                raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
+        manifest.add_inputs(judged_on.recording.files)
+        manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
+        terminal = Terminal(study.settings.quiet, directory / "run.log")
+        terminal.line(f"simpel evaluate · {run} · step {step} · {judged_on.recording.files[0]}", style="bold")
+        judged = judge(judged_on, posteriors(study, fitted.assembled, state), directory, step)
+        constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
+        write_metrics(
+            directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])}
+        )
+        publish(terminal, judged_on, judged, directory, dump(config), "evaluate", run)

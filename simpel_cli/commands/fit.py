@@ -1,0 +1,138 @@
+"""`simpel fit`: fit Bayesian neural networks to measured transitions under a functional prior, judge and report."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from simpel_cli import loop
+from simpel_cli.commands.judge import Judged, judge
+from simpel_cli.commands.show import describe, publish
+from simpel_cli.commands.study import Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
+from simpel_cli.config import Job, dump, load
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError
+from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, write_text
+from simpel_cli.run import Manifest, make_directory, read_manifest
+
+LOG_EVERY = 50  # steps per row of the metric table
+
+
+def fit(job: Job) -> None:
+    """Run a new fit in its run directory."""
+    settings = settings_of(job.config)
+    directory = make_directory(job.directory)
+    if (directory / "manifest.json").exists():
+        raise ConfigError(
+            f"hydra.run.dir: {directory} holds a run already. Go on with `simpel fit --resume {directory}`, "
+            "or choose another directory; nothing was changed."
+        )
+    config = resolved(job)
+    write_text(directory / "config.yaml", dump(config))
+    with Manifest(directory, "fit", settings) as manifest:
+        _run(config, directory, job.data_folder, manifest, resume=False)
+
+
+def resume(directory: Path) -> None:
+    """Go on with an interrupted fit, bit for bit as if it had not been interrupted."""
+    record = read_manifest(directory)
+    if record["command"] != "fit":
+        raise ConfigError(f"{directory}: made by `simpel {record['command']}`; only a fit can be resumed.")
+    config = load(directory / "config.yaml")
+    if record.get("status") == "done":
+        Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
+        return
+    with Manifest(directory, "fit", settings_of(config)) as manifest:
+        _run(config, directory, directory, manifest, resume=True)
+
+
+def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool) -> None:
+    study = open_study(config, data_folder)
+    manifest.add_inputs(study.recording.files)
+    manifest.facts["device"] = str(study.device)
+    terminal = Terminal(study.settings.quiet, directory / "run.log")
+    fitted = prepare(study)
+    describe(terminal, study, fitted)
+    start, state = _restored(directory, fitted) if resume else (0, None)
+    constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}
+    metrics = MetricStream(directory, constants, resume_at=start if resume else None)
+    began = time.perf_counter()
+    state = _train(study, fitted, terminal, metrics, directory, state, start)
+    manifest.facts |= {
+        "compile_seconds": round(fitted.program.compile_seconds, 3),
+        "train_seconds": round(time.perf_counter() - began, 3),
+        "n_train": len(fitted.training[0][0]),
+    }
+    judged: Judged = judge(study, posteriors(study, fitted.assembled, state), directory, study.method.steps)
+    metrics.add(judged.rows)
+    metrics.close()
+    publish(terminal, study, judged, directory, dump(config), "fit")
+
+
+def _train(
+    study: Study, fitted: Fitted, terminal: Terminal, metrics: MetricStream, directory: Path, state: Any, start: int
+) -> Any:
+    encoding, steps = study.system.encoding, study.method.steps
+    y_std = np.asarray(fitted.normaliser.y_std)
+    compile_note = f"compile {fitted.program.compile_seconds:.1f} s"
+    with terminal.progress("fit", steps, start) as update:
+        for stretch in loop.train(fitted.program, steps, state=state, start=start):
+            state = stretch.state
+            save_checkpoint(directory / "checkpoint", _leaves(state), {"step": stretch.step, "command": "fit"})
+            metrics.add(_training_rows(study, stretch, encoding, y_std))
+            loss = float(stretch.info.loss[:, -LOG_EVERY:].mean())
+            noise = " ".join(f"{v:.2g}" for v in stretch.info.noise_std[:, -1].mean(axis=0) * y_std)
+            update(stretch.step, f"loss {loss:.3g}  noise {noise}  {compile_note}")
+    return state
+
+
+def _training_rows(study: Study, stretch: loop.Stretch, encoding: Any, y_std: np.ndarray) -> list[dict[str, Any]]:
+    """Means over every `LOG_EVERY` steps of what the steps reported."""
+    rows = []
+    length = stretch.info.loss.shape[1]
+    for begin in range(0, length, LOG_EVERY):
+        part = jax.tree.map(lambda a, b=begin: a[:, b : b + LOG_EVERY].mean(axis=1), stretch.info)
+        step = stretch.step - length + min(begin + LOG_EVERY, length)
+        for i, seed in enumerate(study.settings.all_seeds):
+            base = {"seed": seed, "step": step, "split": "train"}
+            rows.append(base | {"metric": "loss", "unit": "nat", "value": float(part.loss[i])})
+            rows.append(base | {"metric": "mean_kernel", "unit": "1", "value": float(part.mean_kernel[i])})
+            for name, unit, value in zip(encoding.y_names, encoding.y_units, part.noise_std[i] * y_std, strict=True):
+                rows.append(base | {"metric": "noise_std", "output": name, "unit": unit, "value": float(value)})
+    return rows
+
+
+def _leaves(tree: Any) -> dict[str, np.ndarray]:
+    return {jax.tree_util.keystr(p): np.asarray(v) for p, v in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def _restored(directory: Path, fitted: Fitted) -> tuple[int, Any]:
+    """Read the checkpoint into the state of the compiled program."""
+    if not (directory / "checkpoint" / "state.safetensors").exists():
+        return 0, None  # stopped before the first checkpoint: the run starts over, with the same result
+    return checkpointed_state(directory, fitted)
+
+
+def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any]:
+    """Return the step and the state of a run's checkpoint.
+
+    Raises:
+        ConfigError: no checkpoint, a damaged one, or one of another configuration.
+    """
+    arrays, facts = load_checkpoint(directory / "checkpoint")
+    shape = loop.state_shape(fitted.program)
+    paths, structure = jax.tree_util.tree_flatten_with_path(shape)
+    leaves = []
+    for path, expected in paths:
+        name = jax.tree_util.keystr(path)
+        found = arrays.get(name)
+        if found is None or found.shape != expected.shape or found.dtype != expected.dtype:
+            what = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
+            raise ConfigError(
+                f"{directory / 'checkpoint'}: `{name}` is {what}; this configuration needs "
+                f"{expected.dtype}{list(expected.shape)}. The checkpoint belongs to another configuration."
+            )
+        leaves.append(jax.numpy.asarray(found))
+    return int(facts["step"]), jax.tree_util.tree_unflatten(structure, leaves)

@@ -1,0 +1,99 @@
+"""Judge posteriors on held-out episodes and write what people look at: Parquet, figures, report."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from simpel_cli import evaluation as ev
+from simpel_cli.commands.study import Study
+from simpel_cli.data import transitions
+from simpel_cli.records import write_table
+
+
+class Judged(NamedTuple):
+    """What an evaluation found, for the terminal."""
+
+    rows: list[dict[str, Any]]  # metric rows of all seeds
+    blocks: str
+    horizon: float | None  # s, of the free runs; None: no episode is long enough
+
+
+def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: int) -> Judged:
+    """Evaluate the posterior of every seed on the test split.
+
+    Writes `predictions.parquet`, `calibration.parquet` and `horizon.parquet` into `directory`.
+    """
+    encoding, dt = study.system.encoding, study.system.source.dt
+    horizon = study.evaluation.steps(dt)
+    episodes = study.recording.test
+    pairs = transitions(episodes, encoding.stack)
+    x, y = ev.test_arrays(pairs, encoding)
+    blocks = ev.blocks_of(pairs.episode, pairs.row, horizon)
+    follow = tuple(e for e in episodes if e.next_states is None)
+    # the longest roll-out that an episode has room for
+    horizon = min(horizon, max((len(e.states) - 1 - encoding.stack for e in follow), default=0))
+    tables: dict[str, list[dict[str, np.ndarray]]] = {"predictions": [], "calibration": [], "horizon": []}
+    rows: list[dict[str, Any]] = []
+    run = None
+    for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
+        result = ev.one_step(posterior, x, y)
+        found = ev.one_step_table(result, blocks, encoding)
+        tables["predictions"].append(_predictions(seed, pairs, y, result, encoding, dt))
+        tables["calibration"].append(_calibration(seed, result, encoding))
+        run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None
+        if run is not None:
+            found += ev.free_run_table(run, encoding, dt)
+            tables["horizon"].append(_horizon(seed, run, encoding, dt))
+        rows += [{"seed": seed, "step": step, "split": "test", **row} for row in found]
+    for name, parts in tables.items():
+        if parts:
+            write_table(directory / f"{name}.parquet", {k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
+    return Judged(rows, blocks.kind, horizon * dt if run is not None else None)
+
+
+def _predictions(
+    seed: int, pairs: Any, y: np.ndarray, result: ev.OneStep, encoding: Any, dt: float
+) -> dict[str, np.ndarray]:
+    """One row per test transition and output: measured and predicted target with its bands."""
+    n, dy = y.shape
+    columns = {
+        "seed": np.full(n * dy, seed),
+        "episode": np.repeat(pairs.episode, dy),
+        "row": np.repeat(pairs.row, dy),
+        "time": np.repeat(pairs.row * dt, dy),
+        "output": np.tile(encoding.y_names, n),
+        "unit": np.tile(encoding.y_units, n),
+        "measured": y.ravel(),
+        "mean": result.mean.ravel(),
+        "std": result.std.ravel(),
+        "epistemic_std": result.epistemic_std.ravel(),
+    }
+    return columns
+
+
+def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.ndarray]:
+    """Fraction of targets inside the central region of every level, per output and jointly."""
+    names = np.array([*encoding.y_names, "joint"])
+    fraction = result.below.mean(axis=0)
+    return {
+        "seed": np.full(fraction.size, seed),
+        "output": np.repeat(names, len(ev.LEVELS)),
+        "level": np.tile(ev.LEVELS, len(names)),
+        "fraction": fraction.ravel(),
+    }
+
+
+def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, np.ndarray]:
+    """Root mean square error of free runs, and the spread that the posterior claims, by horizon and state."""
+    rmse = np.sqrt((run.error**2).mean(axis=0))
+    claimed = np.sqrt((run.std**2).mean(axis=0))
+    steps, ds = rmse.shape
+    return {
+        "seed": np.full(steps * ds, seed),
+        "horizon": np.repeat(np.arange(steps) * dt, ds),
+        "output": np.tile([q.name for q in encoding.states], steps),
+        "unit": np.tile([q.unit for q in encoding.states], steps),
+        "rmse": rmse.ravel(),
+        "claimed_std": claimed.ravel(),
+    }

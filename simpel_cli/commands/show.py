@@ -1,0 +1,159 @@
+"""The terminal's screen and the report of `fit` and `evaluate`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.commands.judge import Judged
+from simpel_cli.commands.study import Fitted, Study
+from simpel_cli.console import Terminal
+from simpel_cli.plots import draw_run
+from simpel_cli.report import write_report
+
+HEAD = ("NLL", "RMSE", "MAE", "CRPS", "coverage of 90 %", "calibration error")
+METRICS = ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error")
+
+
+def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
+    """Say in a few lines what was understood."""
+    s, recording, source = study.settings, study.recording, study.system.source
+    method, score = study.choices.get("method", ""), study.choices.get("score", "")
+    seeds = f"seed {s.seed}" if s.seeds == 1 else f"seeds {s.seed}..{s.seed + s.seeds - 1}"
+    terminal.line(
+        f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}", style="bold"
+    )
+    failed = [c for c in recording.checks if not c.ok]
+    terminal.line(
+        f"{recording.files[0]}   {len(recording.train)} train / {len(recording.test)} test episodes, "
+        f"{len(fitted.training[0][0])} transitions used, dt {source.dt:g} s   "
+        f"checks {len(recording.checks) - len(failed)} ok" + (f", {len(failed)} to look at" if failed else ""),
+        "data",
+    )
+    for check in failed:
+        terminal.line(f"{check.name}: {check.detail}", "", style="yellow")
+    if recording.estimated:
+        terminal.line(f"not measured, estimated from the position: {', '.join(recording.estimated)}", "")
+    uncertain = " ".join(q.name for q in source.params) or "nothing"
+    kind = "" if study.system.transition is not None else " (queried)"
+    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+
+
+def _gap_text(study: Study, fitted: Fitted) -> str:
+    gap = study.prior.gap
+    if gap is None:
+        return "no gap GP"
+    words = "".join(f" {c.lower()}" if c.isupper() else c for c in type(gap.kernel).__name__).strip()
+    length = gap.lengthscale if gap.lengthscale is not None else 2 * study.system.encoding.dim_x**0.5
+    scale = " ".join(f"{v:.2g}" for v in fitted.assembled.gap_scale)
+    what = "gap GP" if study.prior.uses_simulator else "GP prior, no simulator"
+    return f"{what}: {words}, l {length:.3g}, kappa {scale}"
+
+
+def publish(
+    terminal: Terminal, study: Study, judged: Judged, directory: Path, config: str, command: str, source: Path | None = None
+) -> None:
+    """Print the test results, draw the figures, write the report, and say where things lie and what to type next."""
+    values = _by_metric(judged.rows)
+    n_test = len(study.recording.test)
+    terminal.line()
+    nll, rmse, crps, inside = (values[m, "joint"] for m in ("nll", "rmse", "crps", "coverage_90"))
+    head = f"test ({n_test} episode{'s' if n_test > 1 else ''})"
+    terminal.line(
+        f"{head:<20}NLL {_shown(nll)}   RMSE {_shown(rmse)}   CRPS {_shown(crps)}   coverage of 90 %: {100 * inside[0]:.0f} %"
+    )
+    table = _table(study, values)
+    terminal.line(_aligned(table["head"], table["rows"]))
+    free = _free_run_table(study, values)
+    if free is not None:
+        terminal.line(_aligned(free["head"], free["rows"]))
+    spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
+    terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
+    next_commands = _next(study, directory, command, source)
+    figures = draw_run(directory)
+    tables = [table | {"title": "One step ahead, held-out episodes"}]
+    if free is not None:
+        tables.append(free | {"title": "Free run, root mean square error"})
+    checks = {
+        "title": "Data checks",
+        "head": ("check", "", "what was found"),
+        "rows": [(c.name, "ok" if c.ok else "look", c.detail) for c in study.recording.checks],
+        "text": True,
+    }
+    s = study.settings
+    report = write_report(
+        directory / "report.html",
+        title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
+        lead=f"{study.system.source.name} on {study.recording.files[0].name}, {n_test} test episodes, seeds {s.all_seeds}. "
+        f"Intervals are {spread}, resampling {judged.blocks}.",
+        tables=[*tables, checks],
+        figures=figures,
+        commands=next_commands,
+        config=config,
+    )
+    terminal.line(str(report), "report")
+    for label, line in zip(["next", *[""] * len(next_commands)], next_commands, strict=False):
+        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+
+
+Values = dict[tuple[str, str], tuple[float, float, float]]
+
+
+def _by_metric(rows: list[dict[str, Any]]) -> Values:
+    """Mean over seeds, with the outermost interval ends over seeds."""
+    grouped: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        grouped.setdefault((row["metric"], row["output"]), []).append(row["value"])
+    plain = [key for key in grouped if not key[0].endswith(("_low", "_high"))]
+    return {
+        (metric, output): (
+            float(np.mean(grouped[metric, output])),
+            min(grouped[f"{metric}_low", output]),
+            max(grouped[f"{metric}_high", output]),
+        )
+        for metric, output in plain
+    }
+
+
+def _shown(estimate: tuple[float, float, float]) -> str:
+    value, low, high = estimate
+    return f"{value:.3g} ({low:.3g}..{high:.3g})"
+
+
+def _table(study: Study, values: Values) -> dict[str, Any]:
+    encoding = study.system.encoding
+    names = [*zip(encoding.y_names, encoding.y_units, strict=True), ("joint", "1")]
+    rows = []
+    for name, unit in names:
+        label = name if unit in ("1", "") else f"{name} [{unit}]"
+        rows.append((label, *(_shown(values[m, name]) for m in METRICS)))
+    return {"head": ("change in one step", *HEAD), "rows": rows}
+
+
+def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
+    found = [m for m, _ in values if m.startswith("free_run_rmse@")]
+    metrics = list(dict.fromkeys(found))
+    if not metrics:
+        return None
+    rows = [
+        (f"{q.name} [{q.unit}]", *(_shown(values[m, q.name]) for m in metrics)) for q in study.system.encoding.states
+    ]
+    return {"head": ("free run, RMSE", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
+
+
+def _aligned(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Columns of equal width, for terminals."""
+    cells = [head, *rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return "\n".join("  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells)
+
+
+def _next(study: Study, directory: Path, command: str, source: Path | None) -> list[str]:
+    run = source or directory
+    name = study.settings.name
+    lines = [f"simpel evaluate {run} data=NAME          # judge it on other measurements"]
+    if command == "fit":
+        lines.append(f"simpel sweep experiment={name} method=simpel,fsvgd data.n_train=10,20,40 'run.seed=range(3)'")
+    else:
+        lines.append(f"simpel fit --resume {run}          # if it was interrupted")
+    return lines

@@ -1,0 +1,181 @@
+"""From a resolved configuration to everything that fitting or judging a posterior needs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from simpel_cli import loop
+from simpel_cli.config import Job, build
+from simpel_cli.data import Measurements, Recording, read, select, transitions
+from simpel_cli.errors import ConfigError, did_you_mean
+from simpel_cli.evaluation import Posterior, test_arrays
+from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
+from simpel_cli.prior import GPPrior, SimulatorPrior
+from simpel_cli.problem import Assembled, System, assemble, normaliser_of, system_of
+from simpel_cli.run import Settings, configure, stream
+
+STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
+GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The `evaluation:` group.
+
+    Args:
+        horizon: length of the free runs, s.
+    """
+
+    horizon: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.horizon > 0:
+            raise ConfigError(f"evaluation.horizon: got {self.horizon}; it must be positive (s).")
+
+    def steps(self, dt: float) -> int:
+        """Number of transitions in the horizon, at least 1."""
+        return max(1, round(self.horizon / dt))
+
+
+class Study(NamedTuple):
+    """A configuration turned into objects, with the measurements read."""
+
+    settings: Settings
+    device: Any
+    system: System
+    measurements: Measurements
+    recording: Recording
+    prior: SimulatorPrior | GPPrior
+    score: Any
+    method: Method
+    evaluation: Evaluation
+    choices: dict[str, str]
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Columns of the metric table that are the same in every row."""
+        return {
+            "experiment": self.settings.name,
+            "method": self.choices.get("method", ""),
+            "sim": self.system.source.name,
+            "data": self.choices.get("data", ""),
+            "output": "",
+            "unit": "",
+        }
+
+
+def settings_of(config: dict[str, Any]) -> Settings:
+    """Build the `run:` group and refuse keys that no verb has."""
+    for key in config:
+        if key not in (*GROUPS, "choices", "run_dir"):
+            raise ConfigError(f"{key}: no such key.{did_you_mean(key, list(GROUPS))} (groups: {', '.join(GROUPS)})")
+    return build(config.get("run") or {}, "run", default=Settings)
+
+
+def source_of(config: dict[str, Any], settings: Settings) -> Any:
+    """Build the `sim:` group: a symbolic model, or a world with query access only."""
+    declared = build(config["sim"], "sim", settings.plugins)
+    try:
+        return declared.model()
+    except ValueError as error:  # simulators.model.ModelError
+        raise ConfigError(str(error)) from error
+
+
+def open_study(config: dict[str, Any], data_folder: Path) -> Study:
+    """Build every object of a configuration and read the measurements.
+
+    Raises:
+        ConfigError: a key.
+        DataError: the measurements.
+    """
+    settings = settings_of(config)
+    device = configure(settings)
+    # everything that can be wrong in the YAML is found before any file is read
+    parts = {name: build(config[name], name, settings.plugins) for name in ("prior", "score", "method")}
+    measurements = build(config["data"], "data", default=Measurements)
+    evaluation = build(config.get("evaluation") or {}, "evaluation", default=Evaluation)
+    source = source_of(config, settings)
+    # the split does not depend on run.seed: every seed of a sweep is judged on the same episodes
+    recording = read(measurements, source, data_folder, 0)
+    system = system_of(source, recording.outputs, measurements.stack_actions)
+    return Study(
+        settings, device, system, measurements, recording, **parts, evaluation=evaluation, choices=config["choices"]
+    )
+
+
+def resolved(job: Job) -> dict[str, Any]:
+    """Return the configuration as it is kept in the run directory: absolute path of the data, choices of groups."""
+    config = dict(job.config)
+    path = (config.get("data") or {}).get("path")
+    if isinstance(path, str):
+        places = [job.data_folder / path, Path(path)]
+        found = next((p for p in places if p.is_file()), places[0])
+        config["data"] = config["data"] | {"path": str(found.resolve())}
+    return config
+
+
+class Fitted(NamedTuple):
+    """A compiled rule on the training transitions of every seed."""
+
+    assembled: Assembled
+    program: loop.Program
+    training: list[tuple[np.ndarray, np.ndarray]]
+    normaliser: Normaliser
+
+
+def prepare(study: Study) -> Fitted:
+    """Choose the training transitions of every seed, assemble the problems and compile the rule."""
+    settings, measurements = study.settings, study.measurements
+    pairs = transitions(study.recording.train, measurements.stack_actions)
+    training = [
+        test_arrays(select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding)
+        for seed in settings.all_seeds
+    ]
+    # one normaliser for all seeds and all n_train: results stay comparable
+    normaliser = normaliser_of(study.system, stream(0, "normaliser"))
+    noise = getattr(study.method, "noise", None)
+    assembled = assemble(
+        study.system,
+        normaliser,
+        study.prior,
+        study.score,
+        training,
+        study.recording.noise_std,
+        least_noise=noise.least_init if noise is not None else 0.1,
+        pool=getattr(study.method, "pool", 0),
+        keys=[stream(seed, "prior") for seed in settings.all_seeds],
+        precision=settings.precision,
+    )
+    keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
+    rule = _bound(study.method, assembled.setting)
+    return Fitted(assembled, loop.compiled(rule, assembled.problems, keys, STRETCH), training, normaliser)
+
+
+def _bound(method: Method, setting: Setting) -> Any:
+    def bind(problem: Problem) -> Inference:
+        return method.bind(setting, problem)
+
+    return bind
+
+
+def posteriors(study: Study, assembled: Assembled, state: Any) -> list[Posterior]:
+    """Return the posterior of every seed as functions of arrays in data units."""
+    bind = _bound(study.method, assembled.setting)
+    predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
+    members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
+    dtype = assembled.problems.x.dtype
+    result = []
+    for i in range(study.settings.seeds):
+        problem, own = jax.tree.map(lambda a, i=i: a[i], (assembled.problems, state))
+        result.append(
+            Posterior(
+                predict=lambda x, p=problem, s=own: predict(p, s, jnp.asarray(x, dtype)),
+                members=lambda x, p=problem, s=own: members(p, s, jnp.asarray(x, dtype)),
+                particles=study.method.particles,
+            )
+        )
+    return result

@@ -1,0 +1,190 @@
+"""What can be wrong with rows: each check reports, and drops, cuts or refuses where it must."""
+
+import math
+
+import numpy as np
+
+from simpel_cli.data.config import Measurements
+from simpel_cli.data.recording import Check
+from simpel_cli.data.rows import Rows
+from simpel_cli.data.table import Table
+from simpel_cli.data.units import period
+from simpel_cli.errors import ConfigError, DataError
+from simulators.model import Model, Quantity
+
+DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
+STALE_SHARE = 0.05  # of the rows; fewer repeats are what a quantised sensor gives
+
+
+def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Check, Rows]:
+    """Drop rows with NaN or inf. The jump that stays in `position` cuts the episode there.
+
+    The last row of an episode often has no command: it stays, with the input held, since no transition starts there.
+
+    Args:
+        rows: of the file.
+        measured: mask (n_states,); the columns of the others are NaN throughout and do not count.
+        names: of time, measured states, inputs, outputs and next states, in that order.
+
+    Raises:
+        DataError: no row is left.
+    """
+    last = np.append(rows.episode[1:] != rows.episode[:-1], True) & (rows.position > 0)
+    inputs = rows.inputs.copy()
+    if measured.size and rows.next_states.shape[1] == 0:
+        ends = np.flatnonzero(last & ~np.isfinite(inputs).all(axis=1))
+        inputs[ends] = inputs[ends - 1]
+    rows = rows._replace(inputs=inputs)
+    values = np.column_stack([rows.time, rows.states[:, measured], inputs, rows.outputs, rows.next_states])
+    good = np.isfinite(values)
+    keep = good.all(axis=1) & (rows.episode != "")
+    dropped = len(keep) - int(keep.sum())
+    if dropped == len(keep):
+        raise DataError("no row is complete: every one has NaN, inf or nothing in one of its columns.")
+    if dropped == 0:
+        return Check("finite", True, f"all {len(keep)} rows"), rows
+    where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
+    detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or nothing in {where}); episodes are cut there"
+    return Check("finite", False, detail), rows.take(keep)
+
+
+def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
+    """Refuse time that stands still or runs backwards within an episode.
+
+    Raises:
+        DataError: names row, episode and the two times.
+    """
+    back = (np.diff(rows.time) <= 0) & _same_episode(rows)
+    if back.any():
+        i = int(np.flatnonzero(back)[0])
+        fault = "stands still" if rows.time[i + 1] == rows.time[i] else "runs backwards"
+        cure = "Sort the file or remove repeated rows."
+        if config.episode is None:
+            cure += " If the file holds several episodes, name their column: data.episode."
+        raise DataError(
+            f"time {fault} at {table.place(int(rows.number[i + 1]))} of {table.path.name}, episode {rows.episode[i]}: "
+            f"{rows.time[i]:.6g} s, then {rows.time[i + 1]:.6g} s. {cure}"
+        )
+    return Check("time", True, "increasing")
+
+
+def sampling(rows: Rows, model: Model, config: Measurements) -> tuple[Check, float]:
+    """Compare the distance of the rows with the simulator's dt.
+
+    Returns:
+        The check, and the dt of the data, s (median).
+
+    Raises:
+        ConfigError: data.resample is not the simulator's dt.
+        DataError: too few rows, or a dt that is not the simulator's.
+    """
+    if config.resample is not None and not math.isclose(config.resample, model.dt, rel_tol=1e-3):
+        raise ConfigError(
+            f"data.resample: {config.resample:g} s is not the dt of simulator '{model.name}'. "
+            f"Set data.resample: {model.dt:g}, or sim.dt: {config.resample:g}."
+        )
+    steps = np.diff(rows.time)[_follows(rows)]
+    if len(steps) == 0 and not model.states and config.resample is None:
+        return Check("sampling", True, "every row is an episode of its own"), model.dt
+    if len(steps) == 0:
+        raise DataError(f"too few rows: none of {len(rows.time)} rows follows another in the same episode.")
+    dt = float(np.median(steps))
+    if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
+        in_ms = " The time looks like ms: it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
+        raise DataError(
+            f"the rows are {dt:.4g} s apart, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
+            f"Bring the data to it with data.resample: {model.dt:g}, or set sim.dt: {dt:.4g}."
+        )
+    jitter = float(np.mean(np.abs(steps / dt - 1) > DT_TOLERANCE))
+    detail = f"dt {dt:.4g} s" + (f", {jitter:.1%} of the steps differ by more than 2 %" if jitter else "")
+    return Check("sampling", jitter < STALE_SHARE or config.resample is not None, detail), dt
+
+
+def gaps(rows: Rows, dt: float, max_gap: float | int | None) -> tuple[Check, np.ndarray]:
+    """Find where a segment of contiguous rows starts.
+
+    Args:
+        rows: checked for NaN.
+        dt: of the data, s.
+        max_gap: s; None = 1.5 dt.
+
+    Returns:
+        The check, and a mask (n,): True at the first row of every segment (new episode, new split, dropped row, gap).
+    """
+    limit = 1.5 * dt if max_gap is None else max_gap
+    steps = np.diff(rows.time)
+    gap = _follows(rows) & (steps > limit)
+    starts = np.concatenate([[True], ~_follows(rows) | gap | (rows.split[1:] != rows.split[:-1])])
+    if not gap.any():
+        return Check("gaps", True, f"no step longer than {limit:.3g} s"), starts
+    shown = [f"episode {rows.episode[i]} at {rows.time[i]:.4g} s ({steps[i]:.3g} s)" for i in np.flatnonzero(gap)[:3]]
+    more = ", ..." if gap.sum() > len(shown) else ""
+    detail = f"{int(gap.sum())} gaps longer than {limit:.3g} s, cut there: {', '.join(shown)}{more}"
+    return Check("gaps", False, detail), starts
+
+
+def constant(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+    """Warn of columns that never change.
+
+    Raises:
+        DataError: no measured state or output changes, so there is nothing to learn.
+    """
+    columns = {name: values for name, values in _named(rows, model, outputs).items() if len(values) > 1}
+    still = [name for name, values in columns.items() if np.ptp(values) == 0]
+    moving = [name for name in columns if name not in still and name not in {q.name for q in model.inputs}]
+    if columns and not moving:
+        raise DataError(f"nothing moves: {', '.join(still)} are constant over all {len(rows.time)} rows.")
+    return Check("constant", not still, f"constant: {', '.join(still)}" if still else "every column changes")
+
+
+def stale(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+    """Warn of rows that repeat all measured states and outputs of the row before."""
+    inputs = {q.name for q in model.inputs}
+    observed = [values for name, values in _named(rows, model, outputs).items() if name not in inputs]
+    repeats = np.diff(np.column_stack(observed), axis=0) == 0
+    share = float(np.mean(repeats.all(axis=1)[_follows(rows)])) if _follows(rows).any() else 0.0
+    if share <= STALE_SHARE:
+        return Check("stale", True, "rows are fresh")
+    return Check(
+        "stale", False, f"{share:.0%} of the rows repeat the one before: held samples, a coarse sensor or rest"
+    )
+
+
+def ranges(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+    """Count values outside the simulator's declared ranges; angles are compared modulo a turn."""
+    quantities = {q.name: q for q in (*model.states, *model.inputs, *model.outputs)}
+    found = []
+    for name, values in _named(rows, model, outputs).items():
+        quantity = quantities[name]
+        outside = int(np.sum(_outside(values, quantity)))
+        if outside:
+            box = f"[{quantity.low:g}, {quantity.high:g}] {quantity.unit}"
+            found.append(f"{name} {outside} of {len(values)} outside {box}")
+    return Check("ranges", not found, "; ".join(found) if found else "all values inside the declared ranges")
+
+
+def _outside(values: np.ndarray, quantity: Quantity) -> np.ndarray:
+    turn = period(quantity)
+    if turn is not None:
+        # the turn that starts half a turn below the middle of the range, so that the range is not torn
+        start = (quantity.low + quantity.high - turn) / 2
+        values = (values - start) % turn + start
+    slack = 1e-6 * (quantity.high - quantity.low)
+    return (values < quantity.low - slack) | (values > quantity.high + slack)
+
+
+def _named(rows: Rows, model: Model, outputs: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Measured columns by name: states, inputs, outputs."""
+    states = {q.name: column for q, column in zip(model.states, rows.states.T, strict=True)}
+    measured = {name: column for name, column in states.items() if not np.isnan(column).all()}
+    inputs = {q.name: column for q, column in zip(model.inputs, rows.inputs.T, strict=True)}
+    return measured | inputs | dict(zip(outputs, rows.outputs.T, strict=True))
+
+
+def _same_episode(rows: Rows) -> np.ndarray:
+    return rows.episode[1:] == rows.episode[:-1]
+
+
+def _follows(rows: Rows) -> np.ndarray:
+    """Mask (n-1,): row i+1 is the next row of the same episode, none was dropped between."""
+    return _same_episode(rows) & (np.diff(rows.position) == 1)

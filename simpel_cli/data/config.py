@@ -1,0 +1,164 @@
+"""What a data YAML may say: the schema, its defaults and its validation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from simpel_cli.errors import ConfigError, DataError, did_you_mean
+
+LAYOUTS = ("trajectories", "transitions")
+CHOICES = ("random", "first")
+SPLIT_BY = ("episode", "time")
+SPLIT_DEFAULT: dict[str, Any] = {"test_fraction": 0.25, "by": "episode"}
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """A file of measurements and how it maps onto a simulator.
+
+    Args:
+        path: a .parquet or .csv file; relative paths are tried against the config file's folder, then the working one.
+        time: column of the time, s. Without it, a row is one `dt` of the simulator.
+        episode: column that names the episode of a row. Without it, the file is one episode.
+        columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
+        split: `{column: name}` with the values train and test (other values are left out and counted), or
+            `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode.
+        noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
+            at the simulator's dt and is estimated where absent.
+        resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.
+        layout: `trajectories` (rows follow each other) or `transitions` (next values in `next_<state column>`).
+        n_train: number of training transitions to use; null = all.
+        choice: which ones: `random` (seeded; the smaller set is part of the larger one) or `first`.
+        seed: of the split and of the choice; null = the run's seed.
+        n_episodes: use the first so many training episodes; null = all.
+        units: quantity of the simulator -> unit of its column, compared with the simulator's. Also read from Parquet
+            field metadata (`unit`) and from `card.yaml` beside the file (`columns: {phi: {unit: rad}}`).
+        stack_actions: number of past inputs that a transition carries along.
+        max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt of the data.
+
+    Raises:
+        ConfigError: a value that is not allowed; the message names `data.<key>`.
+    """
+
+    path: str
+    time: str | None = None
+    episode: str | None = None
+    columns: Mapping[str, str | None] = field(default_factory=dict)
+    split: Mapping[str, Any] = field(default_factory=lambda: dict(SPLIT_DEFAULT))
+    noise_std: Mapping[str, float | int] = field(default_factory=dict)
+    resample: float | int | None = None
+    layout: str = "trajectories"
+    n_train: int | None = None
+    choice: str = "random"
+    seed: int | None = None
+    n_episodes: int | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    stack_actions: int = 0
+    max_gap: float | int | None = None
+
+    def __post_init__(self) -> None:
+        _one_of("layout", self.layout, LAYOUTS)
+        _one_of("choice", self.choice, CHOICES)
+        _positive("resample", self.resample)
+        _positive("max_gap", self.max_gap)
+        _whole("n_train", self.n_train, 1)
+        _whole("n_episodes", self.n_episodes, 1)
+        _whole("seed", self.seed, 0)
+        _whole("stack_actions", self.stack_actions, 0)
+        for name, std in self.noise_std.items():
+            _positive(f"noise_std.{name}", std)
+        _check_split(self.split)
+        if self.layout == "transitions" and self.stack_actions:
+            raise ConfigError(
+                f"data.stack_actions: {self.stack_actions} past inputs are not known in layout 'transitions', whose "
+                "rows do not follow each other. Set data.stack_actions: 0, or store trajectories."
+            )
+        if self.layout == "transitions" and self.resample is not None:
+            raise ConfigError(
+                "data.resample: rows of layout 'transitions' cannot be resampled. Set data.resample: null."
+            )
+        if self.resample is not None and self.time is None:
+            raise ConfigError(
+                "data.resample: the distance of the rows is not known. Name the column of the time: data.time: <name>."
+            )
+
+    def seed_or(self, run_seed: int) -> int:
+        """Return the seed of the split and of the choice: its own if declared, else the run's."""
+        return run_seed if self.seed is None else self.seed
+
+    def check_names(self, quantities: tuple[str, ...], measurable: tuple[str, ...]) -> None:
+        """Compare the keys with the simulator.
+
+        Args:
+            quantities: names of all states, inputs and outputs.
+            measurable: names of the states and outputs, which can have noise.
+
+        Raises:
+            ConfigError: a key that the simulator does not have.
+        """
+        for key, names, allowed in (
+            ("columns", self.columns, quantities),
+            ("units", self.units, quantities),
+            ("noise_std", self.noise_std, measurable),
+        ):
+            for name in names:
+                if name not in allowed:
+                    raise ConfigError(
+                        f"data.{key}.{name}: the simulator has no such quantity (it has: {', '.join(allowed)})."
+                        + did_you_mean(name, list(allowed))
+                    )
+
+
+def locate(path: str, base: Path) -> Path:
+    """Find the file: an absolute path, else against `base` (the config file's folder), else the working directory.
+
+    Raises:
+        DataError: nothing is there; the message lists the places that were tried.
+    """
+    given = Path(path).expanduser()
+    tried = [given] if given.is_absolute() else [base / given, Path.cwd() / given]
+    for candidate in tried:
+        if candidate.is_file():
+            return candidate.resolve()
+    folder = " It is a folder, not a file." if any(c.is_dir() for c in tried) else ""
+    places = ", ".join(dict.fromkeys(str(c) for c in tried))
+    raise DataError(f"data.path: '{path}' was not found.{folder} Tried: {places}.")
+
+
+def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        hint = did_you_mean(str(value), list(allowed))
+        raise ConfigError(f"data.{key}: {value!r} is not allowed, only {' or '.join(allowed)}.{hint}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _positive(key: str, value: Any) -> None:
+    if value is not None and not (_is_number(value) and 0 < value < float("inf")):
+        raise ConfigError(f"data.{key}: {value!r} is not allowed, only a positive number.")
+
+
+def _whole(key: str, value: Any, least: int) -> None:
+    if value is not None and not (isinstance(value, int) and not isinstance(value, bool) and value >= least):
+        raise ConfigError(f"data.{key}: {value!r} is not allowed, only a whole number of at least {least}.")
+
+
+def _check_split(split: Mapping[str, Any]) -> None:
+    forms = "{column: <name>} or {test_fraction: 0.25, by: episode|time}"
+    allowed = ("column", "test_fraction", "by")
+    for key in split:
+        if key not in allowed:
+            raise ConfigError(f"data.split.{key}: no such key, only {forms}.{did_you_mean(key, list(allowed))}")
+    if not split or ("column" in split and len(split) > 1):
+        raise ConfigError(f"data.split: {dict(split)} is not allowed, only {forms}.")
+    if "column" in split:
+        if not isinstance(split["column"], str):
+            raise ConfigError(f"data.split.column: {split['column']!r} is not the name of a column.")
+        return
+    fraction = split.get("test_fraction", SPLIT_DEFAULT["test_fraction"])
+    if not (_is_number(fraction) and 0 < fraction < 1):
+        raise ConfigError(f"data.split.test_fraction: {fraction!r} is not allowed, only a number between 0 and 1.")
+    _one_of("split.by", split.get("by", SPLIT_DEFAULT["by"]), SPLIT_BY)

@@ -1,0 +1,196 @@
+"""From a data YAML and a simulator to a `Recording`: find, read, check, cut, estimate, resample."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from simpel_cli.data import checks
+from simpel_cli.data.config import Measurements, locate
+from simpel_cli.data.noise import third_difference_std
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.data.resample import resample
+from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
+from simpel_cli.data.smoother import estimate_speeds
+from simpel_cli.data.split import PARTS, assign
+from simpel_cli.data.table import read_table
+from simpel_cli.data.units import check_units, period, read_card
+from simpel_cli.errors import DataError
+from simulators.model import Model, Quantity
+
+
+def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording:
+    """Read measurements for a simulator.
+
+    Args:
+        config: the data YAML.
+        model: gives names, order, units, ranges and dt.
+        base: folder of the config file; relative paths are tried there first, then in the working directory.
+        seed: of the run; `config.seed` wins.
+
+    Returns:
+        Checked episodes, at least one each to train and to test on.
+
+    Raises:
+        ConfigError: a key that does not fit the simulator.
+        DataError: anything wrong with file, columns, rows or units.
+    """
+    measurable = (*model.states, *model.outputs)
+    quantities = (*measurable, *model.inputs)
+    config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
+    path = locate(config.path, base)
+    table = read_table(path)
+    card_units, card = read_card(path)
+    mapping = map_columns(config, model, table)
+    dynamic = bool(model.states) and config.layout == "trajectories"
+
+    report = [check_units(config, table, card_units, mapping.columns, quantities)]
+    measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
+    rows = arrange(config, model, table, mapping)
+    finite, rows = checks.finite(rows, measured, _column_names(config, model, mapping))
+    split, rows = assign(config, table, rows, dynamic, config.seed_or(seed))
+    report += [finite, split]
+    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.stale, checks.ranges)]
+    if config.layout == "transitions":
+        parts = {part: _pairs(config, model, rows, part) for part in PARTS}
+        noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
+    else:
+        report.append(checks.monotonic(rows, table, config))
+        parts, noise, more = _trajectories(config, model, rows, mapping)
+        report += more
+    for part, episodes in parts.items():
+        if not episodes:
+            raise DataError(f"too few rows: no usable {part} transition is left. " + _what_failed(report))
+    return Recording(
+        train=parts["train"],
+        test=parts["test"],
+        outputs=mapping.outputs,
+        noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
+        estimated=mapping.unmeasured,
+        checks=tuple(report),
+        files=(path, card) if card is not None else (path,),
+    )
+
+
+def _trajectories(
+    config: Measurements, model: Model, rows: Rows, mapping: Mapping
+) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
+    """Episodes by split, noise by quantity, checks."""
+    sampling, raw = checks.sampling(rows, model, config)
+    gaps, starts = checks.gaps(rows, raw, config.max_gap)
+    report = [sampling, gaps]
+    tagged = _segments(model, rows, starts)
+    episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
+    of_slope: dict[str, tuple[str, float]] = {}
+    if mapping.unmeasured:
+        episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw)
+        report.append(check)
+    part_of = {episode.name: tag for tag, episode in tagged}
+    noise = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
+    gain = 1.0
+    if config.resample is not None:
+        episodes, gain, check = resample(episodes, raw, config.resample)
+        report.append(check)
+    # the slope of a spline is smooth already: the filter takes nothing more from it
+    noise = {name: std * gain for name, std in noise.items()} | {
+        speed: noise[position] * factor for speed, (position, factor) in of_slope.items() if position in noise
+    }
+    kept, short = _long_enough(config, model, episodes)
+    report += [short, _noise_check(config, model, noise)]
+    return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
+
+
+def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
+    """Contiguous rows with their split; a second segment of episode 3 is called 3/2. Angles are unwrapped."""
+    first = np.flatnonzero(starts)
+    seen: Counter[str] = Counter()
+    segments = []
+    for begin, end in zip(first, np.append(first[1:], len(rows.time)), strict=True):
+        label = str(rows.episode[begin])
+        seen[label] += 1
+        segment = Episode(
+            name=label if seen[label] == 1 else f"{label}/{seen[label]}",
+            time=rows.time[begin:end],
+            states=_unwrap(rows.states[begin:end], model.states),
+            inputs=rows.inputs[begin:end],
+            outputs=rows.outputs[begin:end],
+        )
+        segments.append((str(rows.split[begin]), segment))
+    return segments
+
+
+def _pairs(config: Measurements, model: Model, rows: Rows, part: str) -> tuple[Episode, ...]:
+    """Rows that are transitions on their own, one `Episode` per named episode, or one for all."""
+    chosen = rows.take(rows.split == part)
+    following = chosen.next_states.copy()
+    for i, quantity in enumerate(model.states):
+        turn = period(quantity)
+        if turn is not None:  # the next angle is the one nearest to the angle, as in an episode that was unwrapped
+            following[:, i] -= turn * np.round((following[:, i] - chosen.states[:, i]) / turn)
+    names = chosen.episode if config.episode is not None else np.full(len(chosen.time), part)
+    episodes = []
+    for name in dict.fromkeys(names.tolist()):
+        own = names == name
+        columns = (chosen.time[own], chosen.states[own], chosen.inputs[own], chosen.outputs[own], following[own])
+        episodes.append(Episode(str(name), *columns))
+    return tuple(episodes)
+
+
+def _unwrap(values: np.ndarray, quantities: tuple[Quantity, ...]) -> np.ndarray:
+    turned = values.copy()
+    for i, quantity in enumerate(quantities):
+        turn = period(quantity)
+        if turn is not None:
+            turned[:, i] = np.unwrap(values[:, i], period=turn)
+    return turned
+
+
+def _long_enough(config: Measurements, model: Model, episodes: tuple[Episode, ...]) -> tuple[list[Episode], Check]:
+    """Keep segments with at least one transition."""
+    least = config.stack_actions + (2 if model.states else 1)
+    kept = [episode for episode in episodes if len(episode.time) >= least]
+    short = len(episodes) - len(kept)
+    detail = (
+        f"{short} of {len(episodes)} segments shorter than {least} rows dropped" if short else f"{len(kept)} segments"
+    )
+    return kept, Check("length", short == 0, detail)
+
+
+def _noise(config: Measurements, model: Model, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
+    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter."""
+    names = [q.name for q in model.states] + list(mapping.outputs)
+    std = {}
+    for i, name in enumerate(names):
+        if name not in mapping.columns:
+            continue
+        value = config.noise_std.get(name)
+        if value is None:
+            columns = [np.concatenate([episode.states, episode.outputs], axis=1)[:, i] for episode in train]
+            value = third_difference_std(columns)
+        if np.isfinite(value):
+            std[name] = float(value)
+    return std
+
+
+def _noise_check(config: Measurements, model: Model, noise: dict[str, float]) -> Check:
+    units = {q.name: q.unit for q in (*model.states, *model.outputs)}
+    shown = [
+        f"{name} {config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
+        + (" (declared)" if name in config.noise_std else "")
+        for name, std in noise.items()
+    ]
+    return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
+
+
+def _column_names(config: Measurements, model: Model, mapping: Mapping) -> tuple[str, ...]:
+    """Columns behind `checks.finite`, in its order."""
+    states = [mapping.columns[q.name] for q in model.states if q.name in mapping.columns]
+    inputs = [mapping.columns[q.name] for q in model.inputs]
+    outputs = [mapping.columns[name] for name in mapping.outputs]
+    following = [f"next_{name}" for name in states] if config.layout == "transitions" else []
+    return (config.time or "row number", *states, *inputs, *outputs, *following)
+
+
+def _what_failed(report: list[Check]) -> str:
+    """The warnings so far, which tell why rows are gone."""
+    return "; ".join(f"{check.name}: {check.detail}" for check in report if not check.ok)

@@ -1,0 +1,119 @@
+"""What reading yields: episodes in physical units, and the one-step transitions inside them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from simpel_cli.errors import DataError
+
+
+class Check(NamedTuple):
+    """One thing that was looked at: `ok` False is a warning; `detail` says what was found or done."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+class Episode(NamedTuple):
+    """Contiguous rows at the simulator's dt, float64, physical units, in the simulator's order.
+
+    Angles run on continuously within an episode (they are unwrapped).
+    """
+
+    name: str
+    time: np.ndarray  # (T,) s
+    states: np.ndarray  # (T, n_states)
+    inputs: np.ndarray  # (T, n_inputs), held from a row to the next
+    outputs: np.ndarray  # (T, n_measured_outputs)
+    next_states: np.ndarray | None = None  # (T, n_states) where rows do not follow each other (layout: transitions)
+
+
+class Recording(NamedTuple):
+    """Measurements, checked and split."""
+
+    train: tuple[Episode, ...]
+    test: tuple[Episode, ...]
+    outputs: tuple[str, ...]  # names of the measured outputs
+    noise_std: dict[str, float]  # per state and output, declared or estimated, of the rows in the episodes
+    estimated: tuple[str, ...]  # names of the states that were not measured
+    checks: tuple[Check, ...]
+    files: tuple[Path, ...]  # what was read
+
+
+class Transitions(NamedTuple):
+    """One-step pairs, float64, physical units, not encoded."""
+
+    states: np.ndarray  # (n, ds)
+    inputs: np.ndarray  # (n, (stack + 1) * du), past inputs (oldest first), then the current one
+    next_states: np.ndarray  # (n, ds)
+    outputs: np.ndarray  # (n, dy_out), at the row of the inputs
+    episode: np.ndarray  # (n,) index of the episode
+    row: np.ndarray  # (n,) row in the episode
+
+
+def transitions(episodes: Sequence[Episode], stack_actions: int) -> Transitions:
+    """Cut episodes into transitions; none crosses from one episode into another.
+
+    Without states (a static model) every row that has its past inputs is one.
+
+    Args:
+        episodes: at least one.
+        stack_actions: number of past inputs to carry along; the first so many rows of an episode have no such past.
+
+    Raises:
+        DataError: no episode is long enough.
+    """
+    parts = [_of_episode(index, episode, stack_actions) for index, episode in enumerate(episodes)]
+    joined = Transitions(*(np.concatenate(column) for column in zip(*parts, strict=True))) if parts else None
+    if joined is None or len(joined.row) == 0:
+        raise DataError(f"no transition: none of {len(parts)} episodes has {stack_actions + 2} rows in a row.")
+    return joined
+
+
+def _of_episode(index: int, episode: Episode, stack: int) -> Transitions:
+    length, n_states = episode.states.shape
+    if episode.next_states is not None:
+        rows, following = np.arange(length), episode.next_states
+    elif n_states == 0:
+        rows, following = np.arange(stack, length), episode.states[stack:]
+    else:
+        rows, following = np.arange(stack, length - 1), episode.states[stack + 1 :]
+    past_to_now = [episode.inputs[rows - back] for back in range(stack, -1, -1)]
+    return Transitions(
+        states=episode.states[rows],
+        inputs=np.concatenate(past_to_now, axis=1),
+        next_states=following,
+        outputs=episode.outputs[rows],
+        episode=np.full(len(rows), index),
+        row=rows,
+    )
+
+
+def select(pairs: Transitions, n_train: int | None, choice: str, seed: int) -> Transitions:
+    """Choose training transitions; with the same seed, fewer are always part of more.
+
+    Args:
+        pairs: all training transitions.
+        n_train: how many; None = all, in their order.
+        choice: `random` (the first of a seeded permutation) or `first`.
+        seed: of the permutation.
+
+    Raises:
+        DataError: more are asked for than there are.
+    """
+    available = len(pairs.row)
+    if n_train is None:
+        return pairs
+    if n_train > available:
+        raise DataError(f"data.n_train: {n_train} training transitions are asked for, the data have {available}.")
+    order = stream(seed, "n_train").permutation(available) if choice == "random" else np.arange(available)
+    return Transitions(*(column[order[:n_train]] for column in pairs))
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Random numbers of one purpose: two names never share a stream."""
+    return np.random.default_rng((seed, crc32(name.encode())))

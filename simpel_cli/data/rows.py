@@ -1,0 +1,163 @@
+"""The columns of a file under the simulator's names and in its order, before anything is cut or resampled."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.data.config import Measurements
+from simpel_cli.data.table import Table
+from simpel_cli.errors import DataError
+from simulators.model import Model
+
+
+class Rows(NamedTuple):
+    """Rows of a file, episode by episode; within an episode in the order of the file."""
+
+    number: np.ndarray  # (n,) row in the file, from 0
+    position: np.ndarray  # (n,) row within the episode, from 0; a jump tells that rows were dropped
+    episode: np.ndarray  # (n,) name
+    split: np.ndarray  # (n,) train, test or anything else
+    time: np.ndarray  # (n,) s
+    states: np.ndarray  # (n, n_states), NaN in the columns of states that were not measured
+    inputs: np.ndarray  # (n, n_inputs)
+    outputs: np.ndarray  # (n, n_measured_outputs)
+    next_states: np.ndarray  # (n, n_states) in layout transitions, else (n, 0)
+
+    def take(self, chosen: np.ndarray) -> "Rows":
+        """Rows chosen by a mask or by indices."""
+        return Rows(*(column[chosen] for column in self))
+
+
+class Mapping(NamedTuple):
+    """Which column holds which quantity."""
+
+    columns: dict[str, str]  # measured quantity -> column
+    outputs: tuple[str, ...]  # measured outputs
+    unmeasured: tuple[str, ...]  # states
+
+
+def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
+    """Find the column of every quantity.
+
+    An output without a column is left out; a state can be declared as not measured; inputs must be there.
+
+    Raises:
+        DataError: a column is missing, an input is declared as not measured, or nothing is measured.
+    """
+    states, inputs, outputs = ([q.name for q in group] for group in (model.states, model.inputs, model.outputs))
+    columns: dict[str, str] = {}
+    for name in [*states, *inputs, *outputs]:
+        column = config.columns.get(name, name)
+        if column is None and name in inputs:
+            raise DataError(
+                f"data.columns.{name}: an input cannot be estimated, it must be measured. "
+                f"Name its column: `columns: {{{name}: <name>}}`."
+            )
+        if column is None or (name in outputs and name not in config.columns and column not in table.columns):
+            continue
+        if column not in table.columns:
+            if name in inputs:
+                cure = f"If it has another name, say `columns: {{{name}: <name>}}`."
+            else:
+                cure = (
+                    f"If it was not measured, say `columns: {{{name}: null}}`; "
+                    f"if it has another name, `columns: {{{name}: <name>}}`."
+                )
+            raise table.missing(column, cure)
+        columns[name] = column
+    measured_outputs = tuple(name for name in outputs if name in columns)
+    unmeasured = tuple(name for name in states if name not in columns)
+    if not measured_outputs and len(unmeasured) == len(states):
+        raise DataError(
+            f"nothing of {table.path.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
+            f"Say `columns: {{{[*states, *outputs, 'name'][0]}: <name>}}`."
+        )
+    return Mapping(columns, measured_outputs, unmeasured)
+
+
+def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) -> Rows:
+    """Bring the columns of a file into the simulator's order, rows sorted by episode (in order of appearance).
+
+    `split` stays empty here.
+
+    Raises:
+        DataError: a column is missing or holds text where numbers should be.
+    """
+    n = len(table)
+    if config.episode is not None:
+        episode = _labels(table, config.episode, "data.episode")
+    elif config.layout == "transitions" and config.split.get("by") != "time":
+        # rows do not follow each other, so that each can go to train or test on its own
+        episode = np.arange(n).astype(str)
+    else:
+        episode = np.full(n, "0")
+    order, position = _by_episode(episode)
+    names = [q.name for q in model.states]
+    following = [_following(table, mapping, name) for name in names] if config.layout == "transitions" else []
+    return Rows(
+        number=np.arange(n),
+        position=position,
+        episode=episode,
+        split=np.full(n, ""),
+        time=_time(config, model, table, position),
+        states=_stack(n, [_numbers(table, mapping, name) for name in names]),
+        inputs=_stack(n, [_numbers(table, mapping, q.name) for q in model.inputs]),
+        outputs=_stack(n, [_numbers(table, mapping, name) for name in mapping.outputs]),
+        next_states=_stack(n, following),
+    ).take(order)
+
+
+def split_labels(config: Measurements, table: Table, column: str) -> np.ndarray:
+    """Column that says of every row of the file whether it is train or test, (n,) text."""
+    return _labels(table, column, "data.split.column")
+
+
+def _labels(table: Table, column: str, key: str) -> np.ndarray:
+    if column not in table.columns:
+        raise table.missing(column, f"Name the right column in {key}.")
+    return table.labels(column)
+
+
+def _time(config: Measurements, model: Model, table: Table, position: np.ndarray) -> np.ndarray:
+    if config.time is None:
+        return position * model.dt
+    if config.time not in table.columns:
+        raise table.missing(
+            config.time, "Name the right column in data.time, or leave it out: then a row is one sim.dt."
+        )
+    return table.numbers(config.time)
+
+
+def _by_episode(episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order of rows that makes episodes contiguous, and the position of every row (in file order) in its episode."""
+    _, first, code = np.unique(episode, return_index=True, return_inverse=True)
+    appearance = first[code]  # sorting by first appearance keeps the order of the episodes in the file
+    order = np.argsort(appearance, kind="stable")
+    starts = np.flatnonzero(np.diff(appearance[order], prepend=-1))
+    run = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
+    position = np.empty(len(order), dtype=int)
+    position[order] = run
+    return order, position
+
+
+def _numbers(table: Table, mapping: Mapping, name: str) -> np.ndarray:
+    column = mapping.columns.get(name)
+    return table.numbers(column) if column is not None else np.full(len(table), np.nan)
+
+
+def _following(table: Table, mapping: Mapping, name: str) -> np.ndarray:
+    if name not in mapping.columns:
+        raise DataError(
+            f"data.columns.{name}: a state that was not measured cannot be estimated in layout 'transitions', "
+            "whose rows do not follow each other. Give its column, or store trajectories."
+        )
+    column = f"next_{mapping.columns[name]}"
+    if column not in table.columns:
+        raise table.missing(
+            column, "Layout 'transitions' needs the next value of every state; else data.layout: trajectories."
+        )
+    return table.numbers(column)
+
+
+def _stack(n: int, columns: list[np.ndarray]) -> np.ndarray:
+    return np.stack(columns, axis=1) if columns else np.empty((n, 0))

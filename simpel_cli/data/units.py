@@ -1,0 +1,98 @@
+"""Units of columns against units of the simulator, and angles."""
+
+import math
+import re
+from pathlib import Path
+
+import yaml
+
+from simpel_cli.data.config import Measurements
+from simpel_cli.data.recording import Check
+from simpel_cli.data.table import Table
+from simpel_cli.errors import DataError
+from simulators.model import Quantity
+
+ALIASES = {
+    "-": "1", "none": "1", "dimensionless": "1",
+    "radian": "rad", "radians": "rad", "degree": "deg", "degrees": "deg", "°": "deg",
+    "sec": "s", "second": "s", "seconds": "s", "meter": "m", "metre": "m", "meters": "m", "metres": "m",
+    "volt": "V", "volts": "V",
+}  # fmt: skip
+
+
+def read_card(path: Path) -> tuple[dict[str, str], Path | None]:
+    """Units that a `card.yaml` beside the data file declares, column -> unit, and the card if there is one.
+
+    Raises:
+        DataError: the card is no YAML, or its `columns` are not a mapping.
+    """
+    card = path.with_name("card.yaml")
+    if not card.is_file():
+        return {}, None
+    try:
+        content = yaml.safe_load(card.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{card} is not valid YAML.") from error
+    columns = (content or {}).get("columns") if isinstance(content or {}, dict) else None
+    if columns is not None and not isinstance(columns, dict):
+        raise DataError(f"{card}: `columns` should be a mapping such as {{phi: {{unit: rad}}}}.")
+    described = {name: about for name, about in (columns or {}).items() if isinstance(about, dict) and "unit" in about}
+    return {str(name): str(about["unit"] or "") for name, about in described.items()}, card
+
+
+def check_units(
+    config: Measurements, table: Table, card: dict[str, str], measured: dict[str, str], quantities: tuple[Quantity, ...]
+) -> Check:
+    """Compare every declared unit with the simulator's; the data YAML wins over the file, the file over the card.
+
+    Args:
+        config: declares units per quantity.
+        table: declares units per column.
+        card: units per column.
+        measured: quantity -> column.
+        quantities: all quantities of the simulator.
+
+    Raises:
+        DataError: units differ; the message names both and, for angles, the factor.
+    """
+    of_column = card | table.units
+    if config.time is not None and _canonical(of_column.get(config.time) or "s") != "s":
+        raise DataError(
+            f"column '{config.time}' of {table.path.name} is in {of_column[config.time]}, time is read in s."
+        )
+    compared = 0
+    for quantity in quantities:
+        column = measured.get(quantity.name)
+        unit = config.units.get(quantity.name, of_column.get(column) if column is not None else None)
+        if column is None or not unit or not quantity.unit:  # one of them is not stated
+            continue
+        compared += 1
+        if _canonical(unit) != _canonical(quantity.unit):
+            raise DataError(_mismatch(table, column, unit, quantity))
+    return Check("units", True, f"{compared} of {len(measured)} columns declare a unit, all as the simulator's")
+
+
+def period(quantity: Quantity) -> float | None:
+    """Length of a full turn in the quantity's unit, None where it is not periodic."""
+    if not quantity.periodic:
+        return None
+    return 360.0 if _canonical(quantity.unit) == "deg" else 2 * math.pi
+
+
+def _mismatch(table: Table, column: str, unit: str, quantity: Quantity) -> str:
+    message = (
+        f"unit of column '{column}' in {table.path.name} is {unit}, but the simulator has '{quantity.name}' "
+        f"in {quantity.unit}."
+    )
+    given, wanted = _canonical(unit), _canonical(quantity.unit)
+    for turn, other, factor in (("deg", "rad", "pi/180"), ("rad", "deg", "180/pi")):
+        if given.replace(turn, other, 1) == wanted and turn in given:
+            return f"{message} Multiply the column by {factor}, so that it is in {quantity.unit}."
+    return f"{message} Convert the column, or correct data.units.{quantity.name} if the unit is declared wrongly."
+
+
+def _canonical(unit: str) -> str:
+    """One spelling per unit: `N*m/V` = `N m / V`, `m/s^2` = `m/s²`, `degrees` = `deg`; order stays as written."""
+    text = unit.strip().replace("²", "2").replace("³", "3").replace("**", "").replace("^", "")
+    words = [word for word in re.split(r"([/])|[\s*·]+", text) if word]
+    return " ".join(ALIASES.get(word, ALIASES.get(word.lower(), word)) for word in words)

@@ -1,0 +1,222 @@
+"""From a simulator and measured transitions to the arrays that an inference rule reads.
+
+Normalisation is the same for every method: inputs by the box of the domain, targets by mean and standard deviation of
+draws of the simulator over that box. Training data never enter it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from simulators.model import Model
+from simulators.parameters import draw
+from simulators.worlds.world import World
+
+from simpel_cli.domain import Domain
+from simpel_cli.encoding import Encoding
+from simpel_cli.errors import ConfigError, SimpelError
+from simpel_cli.gap import marginal_likelihood_scale
+from simpel_cli.inference import Bank, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
+from simpel_cli.transition import Transition, encoding_of, transition
+
+NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
+SCALE_POINTS, SCALE_DRAWS = 128, 512
+DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
+
+
+class System(NamedTuple):
+    """A simulator with the coordinates of its learning problem.
+
+    Args:
+        source: symbolic model, or a world with query access only.
+        encoding: angle encoding, stacking, targets.
+        domain: the declared box.
+        transition: one-step map in JAX; None for a world.
+    """
+
+    source: Model | World
+    encoding: Encoding
+    domain: Domain
+    transition: Transition | None
+
+    def simulate(self, key: PRNGKeyArray, x: np.ndarray, n: int) -> np.ndarray:
+        """Draw n simulators from p(phi) and run each at every input x (M, dx); returns (n, M, dy), float64."""
+        if self.transition is not None:
+            prior = SimulatorPrior(gap=None).bind(self.transition, *self.dims, np.ones(self.encoding.dim_x))
+            return np.asarray(jax.jit(prior.simulate, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
+        return query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
+
+    @property
+    def dims(self) -> tuple[int, int]:
+        """Numbers of network inputs and outputs, (dx, dy)."""
+        return self.encoding.dim_x, self.encoding.dim_y
+
+
+def system_of(source: Model | World, outputs: tuple[str, ...], stack: int) -> System:
+    """Bind a simulator to its coordinates; a model is converted to JAX and checked against CasADi."""
+    encoding = encoding_of(source, outputs, stack)
+    if encoding.dim_y == 0:
+        raise ConfigError(f"sim: {source.name} has neither states nor measured outputs: there is nothing to predict.")
+    step = transition(source, encoding) if isinstance(source, Model) else None
+    return System(source, encoding, Domain(encoding), step)
+
+
+def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) -> np.ndarray:
+    """Run n parameter draws of a world at every input (M, dx); returns targets (n, M, dy).
+
+    Raises:
+        SimpelError: the world returned something that is not finite.
+    """
+    states, stacked = encoding.split_x(x)
+    inputs = stacked[:, stacked.shape[1] - len(world.inputs) :]
+    phi = draw(world.params, np.random.default_rng(seed), n)
+    m = len(x)
+    after = world.step(np.tile(states, (n, 1)), np.tile(inputs, (n, 1)), np.repeat(phi, m, axis=0))
+    if not np.isfinite(after).all():
+        worst = int(np.flatnonzero(~np.isfinite(after).all(axis=1))[0])
+        raise SimpelError(
+            f"sim: {world.name} returned {after[worst]} for state {states[worst % m]}, input {inputs[worst % m]}, "
+            f"parameters {phi[worst // m]}. Narrow its ranges, or make it return finite states."
+        )
+    targets = encoding.to_y(np.tile(states, (n, 1)), after, np.zeros((n * m, 0)))
+    return targets.reshape(n, m, -1)
+
+
+def normaliser_of(system: System, key: PRNGKeyArray) -> Normaliser:
+    """Return the normaliser of a system, float64.
+
+    Raises:
+        ConfigError: an output of the simulator does not vary over domain and parameters.
+    """
+    key_x, key_phi = jax.random.split(key)
+    x = np.asarray(system.domain.sample(key_x, NORMALISER_POINTS, jnp.float64))
+    values = system.simulate(key_phi, x, NORMALISER_DRAWS).reshape(-1, system.encoding.dim_y)
+    y_mean, spread = values.mean(axis=0), values.std(axis=0)
+    gap = system.encoding.per_target(system.source.gap, np.nan)
+    std = np.sqrt(spread**2 + np.where(np.isnan(gap), DEFAULT_GAP_FRACTION * spread, gap) ** 2)
+    for name, value in zip(system.encoding.y_names, std, strict=True):
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(
+                f"sim: the change of `{name}` in one transition has standard deviation {value} over the declared ranges. "
+                "An output that never changes (or overflows) cannot be learned: check ranges and dynamics."
+            )
+    x_mean, x_std = system.domain.x_moments()
+    return Normaliser(x_mean, x_std, y_mean, std)
+
+
+class Assembled(NamedTuple):
+    """What inference needs, and what the report says about it."""
+
+    setting: Setting
+    problems: Problem  # leaves (seeds, ...)
+    gap_scale: np.ndarray | None  # kappa per target in data units, of the first seed; None: no gap
+
+
+def assemble(
+    system: System,
+    normaliser: Normaliser,
+    prior: SimulatorPrior | GPPrior,
+    score: object,
+    training: list[tuple[np.ndarray, np.ndarray]],
+    noise_std: dict[str, float],
+    *,
+    least_noise: float,
+    pool: int,
+    keys: list[PRNGKeyArray],
+    precision: str,
+) -> Assembled:
+    """Build the problem arrays of every seed.
+
+    Args:
+        system: simulator and coordinates.
+        normaliser: of the system.
+        prior: prior declaration.
+        score: score estimator.
+        training: inputs (m, dx) and targets (m, dy) in data units, one pair per seed, all of one length.
+        noise_std: measurement noise per state and output, in its unit.
+        least_noise: least initial noise, in normalised outputs.
+        pool: number of domain points of a bank (for worlds).
+        keys: one per seed, for draws of the prior that are made here.
+        precision: dtype name of the networks.
+    """
+    dtype = jnp.dtype(precision)
+    encoding = system.encoding
+    bound = prior.bind(system.transition, *system.dims, normaliser.x_std)
+    sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
+    noise_init = np.maximum(sigma, least_noise)
+    problems, scales = [], []
+    for (x, y), key in zip(training, keys, strict=True):
+        length = padded_length(len(x))
+        targets = (y - normaliser.y_mean) / normaliser.y_std
+        key_scale, key_bank = jax.random.split(key)
+        scale = _gap_scale(prior, bound, system, normaliser, x, targets, noise_init, key_scale)
+        arrays = Problem(
+            x=pad_rows(x, length),
+            y=pad_rows(targets, length),
+            m=np.int32(len(x)),
+            normaliser=normaliser,
+            gap_scale=scale,
+            noise_init=noise_init,
+            bank=_bank(prior, system, pad_rows(x, length), pool, key_bank),
+        )
+        problems.append(arrays)
+        scales.append(scale)
+
+    def stack(*leaves: np.ndarray) -> jax.Array:
+        stacked = np.stack(leaves)
+        return jnp.asarray(stacked, dtype if np.issubdtype(stacked.dtype, np.floating) else None)
+
+    setting = Setting(bound, score, lambda key, n: system.domain.sample(key, n, dtype))  # type: ignore[arg-type]
+    gap_scale = scales[0] * normaliser.y_std if prior.gap is not None else None
+    return Assembled(setting, jax.tree.map(stack, *problems), gap_scale)
+
+
+def _bank(
+    prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: int, key: PRNGKeyArray
+) -> Bank | None:
+    """Query a world once: at the training inputs and at a pool of domain points."""
+    if system.transition is not None or not prior.uses_simulator:
+        return None
+    key_x, key_phi = jax.random.split(key)
+    points = np.concatenate([x, np.asarray(system.domain.sample(key_x, pool, jnp.float64))])
+    return Bank(points, np.moveaxis(system.simulate(key_phi, points, prior.draws), 0, -1))
+
+
+def _gap_scale(
+    prior: SimulatorPrior | GPPrior,
+    bound: FunctionPrior,
+    system: System,
+    normaliser: Normaliser,
+    x: np.ndarray,
+    targets: np.ndarray,
+    noise_init: np.ndarray,
+    key: PRNGKeyArray,
+) -> np.ndarray:
+    """Return kappa per target in normalised units, by the rule that the prior declares."""
+    gap: GapGP | None = prior.gap
+    zeros = np.zeros(system.encoding.dim_y)
+    if gap is None:
+        return zeros
+    if not isinstance(gap.scale, str):
+        return zeros + gap.scale
+    declared = zeros + np.nan
+    if gap.scale == "declared":
+        declared = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
+    if not np.isnan(declared).any():
+        return declared
+    subset = slice(0, SCALE_POINTS)
+    samples = (system.simulate(key, x[subset], SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
+    normalised = (x[subset] - normaliser.x_mean) / normaliser.x_std
+    correlation = np.asarray(
+        bound._replace(white_variance=0.0).covariance(jnp.asarray(normalised), jnp.ones(len(zeros)))[0]
+    )
+    chosen = [
+        marginal_likelihood_scale(
+            samples[:, :, i], correlation, targets[subset, i], noise_init[i], prior.white_variance
+        )
+        for i in range(len(zeros))
+    ]
+    return np.where(np.isnan(declared), np.array(chosen), declared)
