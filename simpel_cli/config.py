@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import importlib
 import inspect
+import math
 import os
 import re
 import secrets
@@ -190,6 +191,7 @@ class Job(typing.NamedTuple):
     config: dict[str, Any]
     directory: Path
     data_folder: Path  # folder of the data YAML: relative paths of measurements start there
+    words: str = ""  # the overrides that tell this job from the others of a sweep
 
 
 def launch(
@@ -223,7 +225,9 @@ def launch(
         hydra_config = HydraConfig.get()
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
-        return task(Job(typing.cast(dict[str, Any], plain), Path(hydra_config.runtime.output_dir), folder))
+        directory = Path(hydra_config.runtime.output_dir)
+        own = " ".join(w.removeprefix("++") for w in hydra_config.overrides.task if w.removeprefix("++") not in overrides)
+        return task(Job(typing.cast(dict[str, Any], plain), directory, folder, own))
 
     # our own exceptions pass through; what Hydra and OmegaConf raise is translated
     arguments = [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]
@@ -236,6 +240,22 @@ def launch(
         raise ConfigError(_translate(error, verb)) from error
     finally:
         sys.argv = before
+
+
+def count_jobs(overrides: list[str]) -> int:
+    """Return the number of jobs of a multirun.
+
+    Raises:
+        ConfigError: an override is not of the form key=value.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_overrides([_force(o) for o in overrides])
+        return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
+    except HydraException as error:
+        raise ConfigError(_translate(error, "sweep")) from error
 
 
 def load(path: Path) -> dict[str, Any]:

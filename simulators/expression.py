@@ -127,10 +127,12 @@ def _tree(text: str) -> ast.expr:
             f"the expression has {len(text)} characters, {MAX_LENGTH} are allowed: write the system as a Python "
             f"simulator (begins {text[:40]!r})"
         )
+    if "#" in text:  # Python would drop the rest of the line in silence
+        _refuse(text, text.index("#"), "a comment is not allowed inside an expression")
     try:
         return ast.parse(text, mode="eval").body
     except SyntaxError as error:
-        _refuse(text, (error.offset or 1) - 1, f"this is not a formula ({error.msg})")
+        _refuse(text, (error.offset or len(text) + 1) - 1, f"this is not a formula ({error.msg})")
     except (
         ValueError,
         MemoryError,

@@ -196,21 +196,26 @@ def scalar_function(build: Callable[..., casadi.SX]) -> casadi.Function:
     return casadi.Function("f", [x], [build(x[0], x[1])])
 
 
-def assert_values_and_jacobian(function: casadi.Function, x: np.ndarray, tolerance: float = 1e-12) -> None:
-    """Compare a function of one column, with one output column, with CasADi at the point x."""
-    (ours,) = jax.jit(to_jax(function))(x)
-    assert_close(ours, function(x), tolerance)
-    z = casadi.MX.sym("z", len(x))
+def assert_values_and_jacobian(function: casadi.Function, points: np.ndarray, tolerance: float = 1e-12) -> None:
+    """Compare a function of one column, with one output column, with CasADi at several points."""
+    z = casadi.MX.sym("z", points.shape[1])
     jacobian = casadi.Function("J", [z], [casadi.jacobian(function(z), z)])
-    for mode in (jax.jacrev, jax.jacfwd):
-        assert_close(mode(lambda x: to_jax(function)(x)[0])(x), jacobian(x), 1e-9)
+
+    def ours(x: jax.Array) -> jax.Array:
+        return to_jax(function)(x)[0]
+
+    everything = jax.jit(jax.vmap(lambda x: (ours(x), jax.jacrev(ours)(x), jax.jacfwd(ours)(x))))
+    for x, value, reverse, forward in zip(points, *everything(points), strict=True):
+        assert_close(value, function(x), tolerance)
+        assert_close(reverse, jacobian(x), 1e-9)
+        assert_close(forward, jacobian(x), 1e-9)
 
 
 @pytest.mark.parametrize("name", SCALAR)
 def test_scalar_operation(name: str) -> None:
-    for x in np.random.default_rng(1).uniform(0.2, 1.8, (3, 2)):
-        # CasADi's own erfinv is good to 2e-12 only (against SciPy's)
-        assert_values_and_jacobian(scalar_function(SCALAR[name]), x, 1e-11 if name == "erfinv" else 1e-12)
+    points = np.random.default_rng(1).uniform(0.2, 1.8, (5, 2))
+    # CasADi's own erfinv is good to 6e-11 only (against SciPy's)
+    assert_values_and_jacobian(scalar_function(SCALAR[name]), points, 1e-10 if name == "erfinv" else 1e-12)
 
 
 def test_scalar_operations_cover_the_table() -> None:
@@ -224,11 +229,11 @@ def test_scalar_operations_cover_the_table() -> None:
 def test_matrix_operation(name: str) -> None:
     symbols = matrix_symbols()
     function = casadi.Function("f", symbols, [MATRIX[name](*symbols)])
-    for seed in range(3):
-        point = matrix_point(seed)
-        (ours,) = jax.jit(to_jax(function))(*point)
-        rows, columns = function.size_out(0)
-        assert ours.shape == ((rows,) if columns == 1 else (rows, columns))
+    points = [matrix_point(seed) for seed in range(3)]
+    (batch,) = jax.jit(jax.vmap(to_jax(function)))(*(np.stack(values) for values in zip(*points, strict=True)))
+    rows, columns = function.size_out(0)
+    assert batch.shape[1:] == ((rows,) if columns == 1 else (rows, columns))
+    for ours, point in zip(batch, points, strict=True):
         assert_close(ours, function(*point), 1e-12)
 
 
@@ -237,9 +242,11 @@ def test_matrix_operation_jacobian(name: str) -> None:
     z = casadi.MX.sym("z", 21)
     s = casadi.MX(casadi.Sparsity.lower(3), z[9:15])
     result = MATRIX[name](casadi.reshape(z[:9], 3, 3), s, z[15:18], z[18:])
-    a, lower, v, w = matrix_point()
-    x = np.concatenate([a.T.ravel(), lower.T[np.triu_indices(3)], v, w])
-    assert_values_and_jacobian(casadi.Function("f", [z], [casadi.densify(casadi.vec(result))]), x)
+    points = [
+        np.concatenate([a.T.ravel(), lower.T[np.triu_indices(3)], v, w])
+        for a, lower, v, w in map(matrix_point, range(3))
+    ]
+    assert_values_and_jacobian(casadi.Function("f", [z], [casadi.densify(casadi.vec(result))]), np.stack(points))
 
 
 def test_cross_product_is_right() -> None:
@@ -305,14 +312,19 @@ def test_untaken_branch_leaves_the_gradient_alone(name: str, kind: type) -> None
     x = kind.sym("x")
     branch = UNTAKEN[name](x)
     function = casadi.Function("f", [x], [casadi.if_else(x > 0, branch, 3 * x + 1)])
-    slope = jax.grad(lambda x: to_jax(function)(x)[0][0])
+
+    def ours(x: jax.Array) -> jax.Array:
+        return to_jax(function)(x)[0]
+
+    everything = jax.jit(lambda x: (ours(x), jax.jacrev(ours)(x), jax.jacfwd(ours)(x), jax.hessian(ours)(x)))
     for point in (0.0, -0.7):
-        for derivative in (slope, jax.jacfwd(lambda x: to_jax(function)(x)[0][0])):
-            np.testing.assert_array_equal(derivative(jnp.array([point])), [3.0])
-        assert_close(to_jax(function)(jnp.array([point]))[0], function(point), 1e-12)
-    inside = casadi.Function("d", [x], [casadi.gradient(branch, x)])
+        value, reverse, forward, second = everything(jnp.array([point]))
+        np.testing.assert_allclose(value, [3 * point + 1], rtol=1e-15)
+        assert (reverse.item(), forward.item(), second.item()) == (3.0, 3.0, 0.0)
+    inside = casadi.Function("d", [x], [branch, casadi.gradient(branch, x)])
     for point in (1.3, 1.8):  # a guard must not change the branch that is taken
-        assert_close(slope(jnp.array([point])), inside(point), 1e-9)
+        for mine, theirs in zip(everything(jnp.array([point])), inside(point), strict=False):
+            assert_close(mine, theirs, 1e-9)
 
 
 def test_untaken_branch_of_matrices_calls_and_elements() -> None:

@@ -13,6 +13,8 @@ from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
 
 DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
+MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
+LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
 STALE_SHARE = 0.05  # of the rows; fewer repeats are what a quantised sensor gives
 
 
@@ -30,21 +32,22 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
         DataError: no row is left.
     """
     last = np.append(rows.episode[1:] != rows.episode[:-1], True) & (rows.position > 0)
-    inputs = rows.inputs.copy()
+    inputs, note = rows.inputs.copy(), ""
     if measured.size and rows.next_states.shape[1] == 0:
         ends = np.flatnonzero(last & ~np.isfinite(inputs).all(axis=1))
         inputs[ends] = inputs[ends - 1]
+        note = f"; {len(ends)} episodes end without a command" if len(ends) else ""
     rows = rows._replace(inputs=inputs)
     values = np.column_stack([rows.time, rows.states[:, measured], inputs, rows.outputs, rows.next_states])
-    good = np.isfinite(values)
+    good = np.isfinite(values) & (np.abs(values) < LARGEST)
     keep = good.all(axis=1) & (rows.episode != "")
     dropped = len(keep) - int(keep.sum())
     if dropped == len(keep):
         raise DataError("no row is complete: every one has NaN, inf or nothing in one of its columns.")
     if dropped == 0:
-        return Check("finite", True, f"all {len(keep)} rows"), rows
+        return Check("finite", True, f"all {len(keep)} rows{note}"), rows
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
-    detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or nothing in {where}); episodes are cut there"
+    detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or nothing in {where}); episodes are cut there{note}"
     return Check("finite", False, detail), rows.take(keep)
 
 
@@ -89,8 +92,13 @@ def sampling(rows: Rows, model: Model, config: Measurements) -> tuple[Check, flo
     if len(steps) == 0:
         raise DataError(f"too few rows: none of {len(rows.time)} rows follows another in the same episode.")
     dt = float(np.median(steps))
+    in_ms = " The time looks like ms: it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
+    if config.resample is not None and dt > MAX_UPSAMPLING * model.dt:
+        raise DataError(
+            f"the rows are {dt:.4g} s apart: resampling to {model.dt:g} s would invent most rows.{in_ms} "
+            f"Record faster, or set sim.dt: {dt:.4g} and data.resample: null."
+        )
     if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
-        in_ms = " The time looks like ms: it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
         raise DataError(
             f"the rows are {dt:.4g} s apart, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
             f"Bring the data to it with data.resample: {model.dt:g}, or set sim.dt: {dt:.4g}."

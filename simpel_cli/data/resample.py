@@ -40,7 +40,8 @@ def resample(episodes: tuple[Episode, ...], raw: float, dt: float) -> Resampled:
     Returns:
         The episodes with at least two rows, in order, and what was done.
     """
-    taps = lowpass(dt / raw)
+    # a filter longer than every episode leaves nothing, however long: it need not be built in full
+    taps = lowpass(min(dt / raw, max((len(episode.time) for episode in episodes), default=1)))
     brought = tuple(_one(episode, raw, dt, taps) for episode in episodes)
     kept = tuple(episode for episode in brought if len(episode.time) > 1)
     lost = len(brought) - len(kept)

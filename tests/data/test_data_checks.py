@@ -76,6 +76,7 @@ def test_a_last_row_without_command_still_ends_a_transition(tmp_path: Path) -> N
     pairs = transitions(recording.train, 0)
     assert len(pairs.row) == 39
     assert np.isfinite(pairs.inputs).all()
+    assert check(recording, "finite") == Check("finite", True, "all 80 rows; 2 episodes end without a command")
 
 
 def test_gaps_cut_an_episode(tmp_path: Path) -> None:
@@ -111,6 +112,8 @@ def test_dt_must_be_the_simulators(tmp_path: Path) -> None:
     columns["t"] *= 2000
     with pytest.raises(DataError, match="looks like ms"):
         read_columns(tmp_path, columns)
+    with pytest.raises(DataError, match=r"100 s apart: resampling to 0.1 s would invent.*looks like ms"):
+        read_columns(tmp_path, columns, resample=0.1)
 
 
 def test_constant_columns(tmp_path: Path) -> None:

@@ -1,0 +1,151 @@
+"""`simpel sweep`: fit every combination of values through Hydra's multirun, collect what is complete.
+
+Jobs run one after another in a worker process that is kept, so that imports and compiled programs are shared. A job
+that fails, or a worker that dies, costs that job only.
+"""
+
+import contextlib
+import multiprocessing
+import traceback
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from simpel_cli.config import Job, count_jobs, launch
+from simpel_cli.console import Terminal
+from simpel_cli.errors import Interrupted, SimpelError
+from simpel_cli.plots import draw_sweep
+from simpel_cli.records import read_metrics, write_metrics
+from simpel_cli.run import read_manifest
+
+
+class Outcome(NamedTuple):
+    """How a job ended."""
+
+    directory: Path
+    code: int  # exit code that the job would have had as a command
+    error: str
+
+
+class Jobs:
+    """Runs jobs in a worker process and replaces the worker when it dies.
+
+    Args:
+        total: number of jobs of the sweep.
+        terminal: where a line per job goes.
+    """
+
+    def __init__(self, total: int, terminal: Terminal) -> None:
+        self.total, self.terminal = total, terminal
+        self.outcomes: list[Outcome] = []
+        self._pool: ProcessPoolExecutor | None = None
+        self._began = perf_counter()
+
+    def run(self, job: Job) -> None:
+        """Run one job and note how it ended; raises only when the user stops the sweep."""
+        quiet = job._replace(config=job.config | {"run": (job.config.get("run") or {}) | {"quiet": True}})
+        began = perf_counter()
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        future = self._pool.submit(_work, quiet)
+        try:
+            outcome = future.result()
+        except BrokenProcessPool:
+            self._pool = None
+            outcome = Outcome(job.directory, 1, "the worker process died (out of memory, or killed)")
+        except KeyboardInterrupt:
+            # the worker got the same Ctrl-C: it saves its state at the end of its stretch
+            with contextlib.suppress(BrokenProcessPool, KeyboardInterrupt):
+                self.outcomes.append(future.result(timeout=60))
+            raise Interrupted("the sweep was stopped; finished jobs are kept.") from None
+        self.outcomes.append(outcome)
+        self._say(job, outcome, perf_counter() - began)
+        if outcome.code == Interrupted.exit_code:
+            raise Interrupted("the sweep was stopped; finished jobs are kept.")
+
+    def close(self) -> None:
+        """End the worker."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def _say(self, job: Job, outcome: Outcome, seconds: float) -> None:
+        done = len(self.outcomes)
+        left = (perf_counter() - self._began) / done * (self.total - done)
+        what = f"error: {outcome.error}" if outcome.code else _result(outcome.directory)
+        self.terminal.line(
+            f"{done}/{self.total}  {job.words}  {what}  {seconds:.0f} s, about {left / 60:.0f} min left",
+            style="red" if outcome.code else "",
+        )
+
+
+def sweep(overrides: list[str], config_dir: Path | None, cfg: str | None) -> None:
+    """Run the sweep and collect it.
+
+    Raises:
+        SimpelError: a job failed; everything else was collected, and the error says where.
+    """
+    total = count_jobs(overrides)
+    quiet = any(o.replace(" ", "").lower() == "run.quiet=true" for o in overrides)
+    terminal = Terminal(quiet)
+    jobs = Jobs(total, terminal)
+    if not cfg:
+        terminal.line(f"simpel sweep · {total} jobs", style="bold")
+    try:
+        launch("sweep", jobs.run, overrides, config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])
+    finally:
+        jobs.close()
+        if jobs.outcomes:
+            _collect(jobs.outcomes, terminal)
+    failed = [o for o in jobs.outcomes if o.code]
+    if failed:
+        names = "; ".join(f"{o.directory.name}: {o.error}" for o in failed[:5])
+        error = SimpelError(f"{len(failed)} of {len(jobs.outcomes)} jobs failed, the others are collected. {names}")
+        error.exit_code = failed[0].code
+        raise error
+
+
+def _work(job: Job) -> Outcome:
+    """Fit in the worker process."""
+    from simpel_cli.commands.fit import fit
+
+    try:
+        fit(job)
+    except SimpelError as error:
+        return Outcome(job.directory, error.exit_code, str(error))
+    except Exception:  # noqa: BLE001 (a bug in one job must not lose the sweep; its traceback is kept)
+        text = traceback.format_exc()
+        (job.directory / "traceback.txt").write_text(text)
+        return Outcome(job.directory, 1, f"{text.splitlines()[-1]} (see traceback.txt in its directory)")
+    return Outcome(job.directory, 0, "")
+
+
+def _collect(outcomes: list[Outcome], terminal: Terminal) -> None:
+    """Write `sweep.parquet` of the finished jobs and draw the figure."""
+    root = outcomes[0].directory.parent
+    rows: list[dict[str, Any]] = []
+    for outcome in outcomes:
+        with contextlib.suppress(SimpelError):
+            if read_manifest(outcome.directory)["status"] == "done":
+                found = read_metrics(outcome.directory / "metrics.parquet")
+                rows += [row for row in found if row["split"] == "test"]
+    if not rows:
+        return
+    path = write_metrics(root / "sweep.parquet", rows, {})
+    terminal.line()
+    terminal.line(str(path), "results")
+    for metric in ("nll", "rmse"):
+        figure = draw_sweep(path, metric)
+        if figure is not None:
+            terminal.line(str(figure), "figure")
+
+
+def _result(directory: Path) -> str:
+    """Test NLL and RMSE of a finished job."""
+    rows = read_metrics(directory / "metrics.parquet")
+    shown = []
+    for metric in ("nll", "rmse"):
+        values = [r["value"] for r in rows if r["metric"] == metric and r["output"] == "joint"]
+        shown.append(f"{metric.upper()} {sum(values) / len(values):.3g}")
+    return "  ".join(shown)
