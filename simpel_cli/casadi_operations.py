@@ -83,7 +83,10 @@ _LINEAR = {casadi.OP_ASSIGN, casadi.OP_ADD, casadi.OP_SUB, casadi.OP_NEG, casadi
 
 
 def _guarded(operation: Callable[..., Array]) -> Callable[..., Array]:
-    """Stop the cotangent of each operand, element by element, where the slope is not finite; the value stays."""
+    """Stop the cotangent of each operand, element by element, where the slope is not finite; the value stays.
+
+    This makes first derivatives safe. Second ones may still meet an infinite curvature, as of x**1.5 at 0.
+    """
 
     def careful(*operands: Any) -> Array:
         held = [jax.lax.stop_gradient(operand) for operand in operands]
@@ -181,15 +184,12 @@ def _move(op: int, node: casadi.MX) -> Program | None:
         case casadi.OP_GETNONZEROS:
             take = _take(_mapping(node))
             return lambda values, dtype: [take(values[0])]
-        case casadi.OP_ADDNONZEROS:
+        case casadi.OP_SETNONZEROS | casadi.OP_ADDNONZEROS:
             target = _mapping(node)
-            kept = np.flatnonzero(target >= 0)
+            kept = np.flatnonzero(target >= 0)  # CasADi marks with -1 what a later value overwrites
+            if op == casadi.OP_SETNONZEROS:
+                return lambda values, dtype: [values[0].at[target[kept]].set(values[1][kept])]
             return lambda values, dtype: [values[0].at[target[kept]].add(values[1][kept])]
-        case casadi.OP_SETNONZEROS:
-            # CasADi writes in order, so the last of several wins; a scatter of JAX leaves that open.
-            last = {index: k for k, index in enumerate(_mapping(node)) if index >= 0}
-            into, source = np.array([*last], dtype=int), np.array([*last.values()], dtype=int)
-            return lambda values, dtype: [values[0].at[into].set(values[1][source])]
     return None
 
 

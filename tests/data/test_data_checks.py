@@ -60,7 +60,7 @@ def test_clean_data_pass_every_check(tmp_path: Path) -> None:
 def test_rows_with_nan_are_dropped_and_never_bridged(tmp_path: Path) -> None:
     columns = table()
     columns["a"][10], columns["u"][50] = np.nan, np.inf
-    recording = read_columns(tmp_path, columns)
+    recording = read_columns(tmp_path, columns, max_gap=1.0)  # a wide gap is allowed, a dropped row is still a cut
     assert not check(recording, "finite").ok
     assert "2 of 80 rows dropped (NaN, inf or nothing in a, u)" in check(recording, "finite").detail
     episodes = (*recording.train, *recording.test)
@@ -201,3 +201,15 @@ def test_noise_estimate_of_a_known_signal(tmp_path: Path) -> None:
     assert noise["a"] == pytest.approx(0.02, rel=0.15)
     assert noise["w"] == pytest.approx(0.3, rel=0.15)
     assert read_columns(tmp_path, columns, noise_std={"a": 0.5}).noise_std["a"] == 0.5
+
+
+def test_noise_after_resampling_is_that_of_the_new_rows(tmp_path: Path) -> None:
+    columns = table(rows=20_000, episodes=2)
+    columns["t"] = columns["t"] / 10
+    columns["a"] = np.sin(columns["t"]) + np.random.default_rng(2).normal(0, 0.02, 40_000)
+    columns["w"] = np.cos(columns["t"])
+    recording = read_columns(tmp_path, columns, resample=0.1)
+    episode = recording.train[0]
+    left = np.std(episode.states[:, 0] - np.sin(episode.time))
+    assert left < 0.01
+    assert recording.noise_std["a"] == pytest.approx(left, rel=0.15)

@@ -1,0 +1,229 @@
+"""Measured-like data: episodes of a world or model with unknown parameters, excited, sampled and disturbed by noise.
+
+Every draw has its own stream, derived by name from one seed and, within an episode, from its number: more episodes
+leave the first ones as they were, longer ones leave their beginning (unless the excitation scales a whole signal), and
+more noise leaves the motion.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from simulators.expression import did_you_mean
+from simulators.model import Model, ModelError, Quantity
+from simulators.parameters import draw
+from simulators.worlds.excitation import Excitation, HeldRandom
+from simulators.worlds.rk4 import RK4
+from simulators.worlds.world import World
+
+OWN_COLUMNS = ("episode", "t", "split")
+LICENCE = "made by simpel simulate: simulated data, not measured on a real system"
+
+
+class Simulation(NamedTuple):
+    """Simulated measurements.
+
+    Args:
+        columns: name -> one value per row: episode, t (s), states, inputs, outputs, split (train or test). A static
+            model has no episode and no t.
+        card: how they were made, of plain values fit for YAML; `columns` gives the unit of each column.
+
+    """
+
+    columns: dict[str, np.ndarray]
+    card: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """How to turn a world or a model into measurements; the fields are the YAML keys.
+
+    Args:
+        episodes: number of independent trajectories.
+        steps: rows per episode, `dt` of the source apart.
+        seed: of everything random.
+        excitation: law of the inputs, each signal drawn on its own.
+        initial: state -> [low, high] of its uniform initial value; left out: the declared range.
+        noise_std: state or output -> standard deviation of the Gaussian noise on it, in its unit; 0 where left out.
+        truth: parameter -> value; those left out are drawn from their prior.
+        test_fraction: the last episodes (static: rows), so large a fraction, get split = test; 0 = no column `split`.
+        hide_truth: leave the parameter values out of the card.
+
+    Raises:
+        ModelError: a value that is not allowed; names `simulation.<key>`.
+
+    """
+
+    episodes: int = 20
+    steps: int = 100
+    seed: int = 0
+    excitation: Excitation = field(default_factory=HeldRandom)
+    initial: dict[str, Any] = field(default_factory=dict)
+    noise_std: dict[str, float] = field(default_factory=dict)
+    truth: dict[str, float] = field(default_factory=dict)
+    test_fraction: float = 0.25
+    hide_truth: bool = False
+
+    def __post_init__(self) -> None:
+        for key, least in (("episodes", 1), ("steps", 1), ("seed", 0)):
+            if getattr(self, key) < least:
+                raise ModelError(f"simulation.{key}: {getattr(self, key)} is not allowed; give at least {least}")
+        if not 0 <= self.test_fraction < 1:
+            raise ModelError(f"simulation.test_fraction: {self.test_fraction:g} is not allowed; give 0 <= fraction < 1")
+        for name, std in self.noise_std.items():
+            if not 0 <= std < math.inf:
+                raise ModelError(f"simulation.noise_std.{name}: {std:g} is no standard deviation; give 0 or more")
+
+    def run(self, source: Model | World) -> Simulation:
+        """Simulate.
+
+        Raises:
+            ModelError: a name that the source does not have, a range upside down, or a state that is not finite.
+
+        """
+        for quantity in (*source.states, *source.inputs, *source.outputs):
+            if quantity.name in OWN_COLUMNS:
+                raise ModelError(
+                    f"simulation: {source.name} calls a quantity `{quantity.name}`, as one of the columns "
+                    f"{', '.join(OWN_COLUMNS)} is called; choose another name"
+                )
+        _known("noise_std", self.noise_std, (*source.states, *source.outputs))
+        _known("truth", self.truth, source.params)
+        _known("initial", self.initial, source.states)
+        truth = self._truth(source)
+        columns = self._trajectories(source, truth) if source.states else self._static(source, truth)
+        if self.test_fraction:
+            rows = np.arange(self.episodes * self.steps)
+            columns["split"] = self._split(columns.get("episode", rows))
+        return Simulation(columns, self._card(source, truth, columns))
+
+    def _stream(self, name: str, episode: int = 0) -> np.random.Generator:
+        return np.random.default_rng([self.seed, crc32(name.encode()), episode])
+
+    def _truth(self, source: Model | World) -> np.ndarray:
+        """Return the parameter vector (dp,); what is given replaces a draw and leaves the other draws as they were."""
+        drawn = draw(source.params, self._stream("params"), 1)[0]
+        return np.array([self.truth.get(q.name, value) for q, value in zip(source.params, drawn, strict=True)])
+
+    def _trajectories(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
+        n, steps = self.episodes, self.steps
+        inputs = np.zeros((n, steps, len(source.inputs)))
+        for i, quantity in enumerate(source.inputs):
+            for k in range(n):
+                stream = self._stream(f"input.{quantity.name}", k)
+                inputs[k, :, i] = self.excitation.signal(stream, steps, source.dt, quantity)
+        step = RK4(source).step if isinstance(source, Model) else source.step
+        params = np.tile(truth, (n, 1))
+        states = np.zeros((n, steps, len(source.states)))
+        states[:, 0] = self._initial(source)
+        for j in range(1, steps):
+            states[:, j] = step(states[:, j - 1], inputs[:, j - 1], params)
+            self._check_finite(source, states[:, j], j)
+        columns = {"episode": np.repeat(np.arange(n), steps), "t": np.tile(source.dt * np.arange(steps), n)}
+        for i, quantity in enumerate(source.states):
+            columns[quantity.name] = self._measured(quantity, states[:, :, i])
+        for i, quantity in enumerate(source.inputs):
+            columns[quantity.name] = inputs[:, :, i].ravel()
+        flat = (states.reshape(n * steps, -1), inputs.reshape(n * steps, -1), np.tile(truth, (n * steps, 1)))
+        return columns | self._outputs(source, flat, (n, steps))
+
+    def _static(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
+        """Rows of inputs uniform on their ranges, and the outputs there."""
+        n = self.episodes * self.steps
+        columns = {q.name: self._stream(f"input.{q.name}").uniform(q.low, q.high, n) for q in source.inputs}
+        inputs = np.column_stack(list(columns.values())) if columns else np.zeros((n, 0))
+        return columns | self._outputs(source, (np.zeros((n, 0)), inputs, np.tile(truth, (n, 1))), (1, n))
+
+    def _outputs(
+        self, source: Model | World, rows: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int, int]
+    ) -> dict[str, np.ndarray]:
+        if not isinstance(source, Model) or not source.outputs:
+            return {}
+        values = RK4(source).measure(*rows)
+        return {q.name: self._measured(q, values[:, i].reshape(shape)) for i, q in enumerate(source.outputs)}
+
+    def _initial(self, source: Model | World) -> np.ndarray:
+        """Draw the initial states, (episodes, ds)."""
+        start = np.zeros((self.episodes, len(source.states)))
+        for i, quantity in enumerate(source.states):
+            low, high = self._initial_range(quantity)
+            for k in range(self.episodes):
+                start[k, i] = self._stream(f"initial.{quantity.name}", k).uniform(low, high)
+        return start
+
+    def _initial_range(self, quantity: Quantity) -> tuple[float, float]:
+        ends = self.initial.get(quantity.name, (quantity.low, quantity.high))
+        if not (
+            isinstance(ends, (list, tuple))
+            and len(ends) == 2
+            and all(isinstance(end, (int, float)) and math.isfinite(end) for end in ends)
+            and ends[0] <= ends[1]
+        ):
+            raise ModelError(
+                f"simulation.initial.{quantity.name}: {ends!r} is no range; write [low, high] with low <= high"
+            )
+        return float(ends[0]), float(ends[1])
+
+    def _check_finite(self, source: Model | World, states: np.ndarray, j: int) -> None:
+        bad = np.argwhere(~np.isfinite(states))
+        if len(bad):
+            k, i = bad[0]
+            raise ModelError(
+                f"simulation: {source.states[i].name} of {source.name} is {states[k, i]} at t = {j * source.dt:g} s of "
+                f"episode {k}; narrow simulation.initial or the inputs, or give {source.name} smaller steps"
+            )
+
+    def _measured(self, quantity: Quantity, values: np.ndarray) -> np.ndarray:
+        """Add noise to the values (episodes, steps) of one quantity, wrap angles to [-pi, pi); one value per row."""
+        std = self.noise_std.get(quantity.name, 0.0)
+        noise = [self._stream(f"noise.{quantity.name}", k).normal(size=values.shape[1]) for k in range(len(values))]
+        noisy = (values + std * np.array(noise)).ravel()
+        if quantity.periodic:
+            noisy = (noisy + np.pi) % (2 * np.pi) - np.pi
+        return noisy
+
+    def _split(self, groups: np.ndarray) -> np.ndarray:
+        n = int(groups[-1]) + 1
+        if n < 2:
+            raise ModelError(
+                "simulation.test_fraction: one episode cannot be split into train and test; set simulation.episodes: 2 "
+                "or more, or simulation.test_fraction: 0"
+            )
+        n_test = min(max(round(self.test_fraction * n), 1), n - 1)
+        return np.where(groups >= n - n_test, "test", "train")
+
+    def _card(self, source: Model | World, truth: np.ndarray, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+        units = {"t": "s"} | {q.name: q.unit for q in (*source.states, *source.inputs, *source.outputs)}
+        excitation = {"law": type(self.excitation).__name__}
+        if dataclasses.is_dataclass(self.excitation):
+            excitation |= dataclasses.asdict(self.excitation)
+        card: dict[str, Any] = {
+            "source": source.name,
+            "made_by": "simpel simulate",
+            "licence": LICENCE,
+            "seed": self.seed,
+            "dt": source.dt,
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "columns": {name: {"unit": units[name]} for name in columns if name in units},
+            "noise_std": {q.name: float(self.noise_std.get(q.name, 0)) for q in (*source.states, *source.outputs)},
+        }
+        if source.states:
+            card["excitation"] = excitation
+            card["initial"] = {q.name: list(self._initial_range(q)) for q in source.states}
+        if not self.hide_truth:
+            card["truth"] = {q.name: float(value) for q, value in zip(source.params, truth, strict=True)}
+        return card
+
+
+def _known(key: str, given: Mapping[str, Any], quantities: tuple[Quantity, ...]) -> None:
+    names = [quantity.name for quantity in quantities]
+    for name in given:
+        if name not in names:
+            known, hint = ", ".join(names) or "none", did_you_mean(name, names)
+            raise ModelError(f"simulation.{key}.{name}: no such name; known: {known}.{hint}")

@@ -1,0 +1,26 @@
+"""Strict settings for every test: float64 available, no implicit dtype or rank promotion, shapes checked by beartype."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+# compiled programs are shared between tests, workers and runs
+jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "xla"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder with the recordings and the reference's arrays; tests that need it are skipped where it is absent."""
+    folder = Path(os.environ.get("SIMPEL_SHARED", ROOT.parent / "shared"))
+    if not (folder / "data").is_dir():
+        pytest.skip(f"no recordings at {folder}: set SIMPEL_SHARED")
+    return folder

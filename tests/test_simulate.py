@@ -1,0 +1,264 @@
+"""Simulated measurements: closed forms, independent streams, noise, split, card, and what a user may get wrong."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.stats import kstest
+
+from simulators.model import Declared, Model, ModelError, Quantity
+from simulators.worlds.excitation import Excitation, HeldRandom, Multisine, Zero
+from simulators.worlds.mujoco_world import MujocoWorld
+from simulators.worlds.rk4 import RK4
+from simulators.worlds.simulate import Simulate
+
+CONF = Path(__file__).parents[1] / "conf" / "sim"
+U = Quantity("u", "V", -1.0, 3.0)
+
+
+def decay(**changes: Any) -> Model:
+    """c' = -k c + b u, measured also through q = 2 c + u."""
+    node: dict[str, Any] = {
+        "name": "decay",
+        "dt": 0.1,
+        "states": {"c": {"unit": "mol", "range": [1, 2]}},
+        "inputs": {"u": {"unit": "V", "range": [-1, 3]}},
+        "parameters": {"k": {"unit": "1/s", "range": [0.5, 2]}, "b": {"unit": "mol/s/V", "range": [0, 1]}},
+        "dynamics": {"c": "-k*c + b*u"},
+        "outputs": {"q": {"unit": "C", "expression": "2*c + u"}},
+    }
+    return Declared(**(node | changes)).model()
+
+
+def turntable() -> Model:
+    """An angle that runs through many turns."""
+    return Declared(
+        "turntable",
+        dt=0.1,
+        states={"a": {"unit": "rad", "range": [-3, 3], "periodic": True}, "w": {"unit": "rad/s", "range": [8, 9]}},
+        dynamics={"a": "w", "w": "0"},
+    ).model()
+
+
+def static() -> Model:
+    return Declared(
+        "line",
+        dt=1,
+        inputs={"x": {"unit": "1", "range": [-5, 5]}},
+        parameters={"a": {"unit": "1", "range": [1, 2], "prior": "normal"}},
+        outputs={"f": {"unit": "m", "expression": "a*x + 1"}},
+    ).model()
+
+
+def world_of(file: str) -> Any:
+    node = yaml.safe_load((CONF / file).read_text())
+    del node["_target_"]
+    return MujocoWorld(**node).model()
+
+
+def test_the_free_decay_is_the_closed_form() -> None:
+    columns, card = Simulate(episodes=3, steps=30, excitation=Zero(), truth={"k": 1.3}).run(decay())
+    t, c = columns["t"].reshape(3, 30), columns["c"].reshape(3, 30)
+    np.testing.assert_allclose(t[1], 0.1 * np.arange(30))
+    np.testing.assert_allclose(c, c[:, :1] * np.exp(-1.3 * t), rtol=1e-8)
+    assert ((c[:, 0] >= 1) & (c[:, 0] <= 2)).all()
+    assert len(set(c[:, 0])) == 3
+    np.testing.assert_array_equal(columns["episode"], np.repeat([0, 1, 2], 30))
+    assert card["truth"]["k"] == 1.3
+
+
+def test_an_input_acts_from_its_row_to_the_next_and_outputs_belong_to_their_row() -> None:
+    columns, card = Simulate(episodes=1, steps=20, test_fraction=0).run(decay())
+    k, b = card["truth"]["k"], card["truth"]["b"]
+    c, u = columns["c"], columns["u"]
+    keep = np.exp(-k * 0.1)
+    np.testing.assert_allclose(c[1:], keep * c[:-1] + (1 - keep) * b / k * u[:-1], rtol=1e-7)
+    np.testing.assert_allclose(columns["q"], 2 * c + u, rtol=1e-12)
+    assert "split" not in columns
+
+
+def test_rk4_converges_at_order_four() -> None:
+    errors = []
+    for substeps in (1, 2):
+        after = RK4(decay(substeps=substeps)).step(np.ones((1, 1)), np.zeros((1, 1)), np.array([[2.0, 0.0]]))
+        errors.append(abs(after[0, 0] - np.exp(-0.2)))
+    assert 14 < errors[0] / errors[1] < 18
+
+
+def test_rk4_answers_each_query_with_its_own_parameters() -> None:
+    k = np.array([[0.5, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    after = RK4(decay()).step(np.full((3, 1), 1.5), np.zeros((3, 1)), k)
+    np.testing.assert_allclose(after[:, 0], 1.5 * np.exp(-0.1 * k[:, 0]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("source", [decay(), static(), turntable(), world_of("pendulum_world.yaml")])
+def test_the_seed_decides_everything(source: Any) -> None:
+    noise = {q.name: 0.1 for q in (*source.states, *source.outputs)}
+
+    def run(seed: int) -> dict[str, np.ndarray]:
+        return Simulate(episodes=2, steps=4, seed=seed, noise_std=noise).run(source).columns
+
+    first, again, other = run(5), run(5), run(6)
+    for name, values in first.items():
+        np.testing.assert_array_equal(again[name], values)
+        if name not in ("episode", "t", "split"):
+            assert (other[name] != values).all()
+
+
+def test_more_episodes_and_longer_ones_leave_the_first_as_they_were() -> None:
+    noise, source = {"c": 0.1, "q": 0.1}, decay()
+    small = Simulate(episodes=3, steps=10, noise_std=noise, test_fraction=0).run(source)
+    more = Simulate(episodes=5, steps=10, noise_std=noise, test_fraction=0).run(source)
+    longer = Simulate(episodes=3, steps=17, noise_std=noise, test_fraction=0).run(source)
+    for name in ("c", "u", "q"):
+        np.testing.assert_array_equal(more.columns[name][:30], small.columns[name])
+        np.testing.assert_array_equal(longer.columns[name].reshape(3, 17)[:, :10], small.columns[name].reshape(3, 10))
+    assert more.card["truth"] == longer.card["truth"] == small.card["truth"]
+
+
+def test_a_given_parameter_leaves_the_other_draws_as_they_were() -> None:
+    free = Simulate(episodes=2, steps=5).run(decay())
+    given = Simulate(episodes=2, steps=5, truth={"k": 0.7}).run(decay())
+    assert given.card["truth"] == {"k": 0.7, "b": free.card["truth"]["b"]}
+    np.testing.assert_array_equal(given.columns["u"], free.columns["u"])
+
+
+def test_noise_is_white_gaussian_independent_and_not_fed_back() -> None:
+    std = {"c": 0.3, "q": 0.05}
+    clean = Simulate(episodes=10, steps=400).run(decay()).columns
+    noisy = Simulate(episodes=10, steps=400, noise_std=std).run(decay()).columns
+    np.testing.assert_array_equal(noisy["u"], clean["u"])
+    noise = {name: (noisy[name] - clean[name]) / std[name] for name in std}
+    for values in noise.values():
+        assert abs(values.std() - 1) < 0.1
+        assert kstest(values, "norm").pvalue > 1e-3
+        assert abs(np.corrcoef(values[1:], values[:-1])[0, 1]) < 4 / np.sqrt(4000)
+    assert abs(np.corrcoef(noise["c"], noise["q"])[0, 1]) < 4 / np.sqrt(4000)
+    assert abs(np.corrcoef(noise["c"].reshape(10, 400)[:2])[0, 1]) < 4 / np.sqrt(400)
+
+
+def test_angles_are_wrapped_after_the_noise() -> None:
+    columns = Simulate(episodes=2, steps=60, noise_std={"a": 0.2}).run(turntable()).columns
+    a, w = columns["a"].reshape(2, 60), columns["w"].reshape(2, 60)
+    assert a.min() >= -np.pi
+    assert a.max() < np.pi
+    turned = np.angle(np.exp(1j * (a - a[:, :1] - w * 0.1 * np.arange(60))))  # the noise of the row and of the first
+    assert 0 < np.abs(turned).max() < 1.5
+
+
+@pytest.mark.parametrize(("episodes", "fraction", "n_test"), [(8, 0.25, 2), (3, 0.01, 1), (2, 0.9, 1), (10, 0.5, 5)])
+def test_the_last_episodes_are_the_test(episodes: int, fraction: float, n_test: int) -> None:
+    columns = Simulate(episodes=episodes, steps=3, test_fraction=fraction).run(decay()).columns
+    expected = np.where(columns["episode"] >= episodes - n_test, "test", "train")
+    np.testing.assert_array_equal(columns["split"], expected)
+
+
+def test_a_static_model_gives_rows_of_inputs_and_outputs() -> None:
+    columns, card = Simulate(episodes=1, steps=2000, noise_std={"f": 0.2}).run(static())
+    assert list(columns) == ["x", "f", "split"]
+    assert kstest(columns["x"], "uniform", (-5, 10)).pvalue > 1e-3
+    assert abs((columns["f"] - card["truth"]["a"] * columns["x"] - 1).std() / 0.2 - 1) < 0.1
+    assert (columns["split"] == "test").sum() == 500
+    assert "excitation" not in card
+
+
+def test_initial_ranges() -> None:
+    columns = Simulate(episodes=40, steps=1, initial={"c": [7, 7.5]}).run(decay()).columns
+    assert columns["c"].min() >= 7
+    assert 7.3 < columns["c"].max() <= 7.5
+
+
+def test_the_card_says_how_the_data_were_made_in_plain_yaml() -> None:
+    how = Simulate(episodes=2, steps=5, seed=4, noise_std={"c": 0.1}, excitation=HeldRandom(0.1, 0.2))
+    card = how.run(decay()).card
+    assert yaml.safe_load(yaml.safe_dump(card)) == card
+    assert card["columns"] == {"t": {"unit": "s"}, "c": {"unit": "mol"}, "u": {"unit": "V"}, "q": {"unit": "C"}}
+    assert card["excitation"] == {"law": "HeldRandom", "shortest": 0.1, "longest": 0.2}
+    assert card["noise_std"] == {"c": 0.1, "q": 0.0}
+    assert card["initial"] == {"c": [1.0, 2.0]}
+    assert (card["source"], card["seed"], card["dt"]) == ("decay", 4, 0.1)
+    assert 0.5 <= card["truth"]["k"] <= 2
+    assert "truth" not in Simulate(episodes=2, steps=5, hide_truth=True).run(decay()).card
+
+
+def test_a_world_is_simulated_and_its_gap_stands_out_of_the_noise() -> None:
+    std = {"phi": 0.01, "omega": 0.05}
+    truth = {"m": 1, "l": 1, "C_m": 1, "friction_loss": 0.2, "damping": 0.1, "drag": 0.5}
+    columns, card = Simulate(episodes=6, steps=40, noise_std=std, truth=truth).run(world_of("pendulum_world.yaml"))
+    assert card["truth"] == truth
+    node = yaml.safe_load((CONF / "pendulum.yaml").read_text())
+    del node["_target_"]
+    gravity_only = RK4(Declared(**node).model())
+    states = np.column_stack([columns["phi"], columns["omega"]])
+    predicted = gravity_only.step(states, columns["u"][:, None], np.tile([1.0, 1.0, 1.0], (240, 1)))
+    last = np.arange(240) % 40 == 39
+    omega = states[:, 1][~last]
+    residual = (states[1:, 1] - predicted[:-1, 1])[~last[:-1]]
+    slope, error = _slope(omega, residual)
+    assert slope < -10 * error  # it brakes, in both directions
+    assert -0.05 < slope < -0.005  # 1/s times 0.05 s: damping, drag and friction together
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    slope = (x @ y) / (x @ x)
+    return slope, np.std(y - slope * x) / np.sqrt(x @ x)
+
+
+@pytest.mark.parametrize("law", [HeldRandom(), HeldRandom(0.3, 0.3), Multisine(), Zero()])
+def test_excitations_stay_in_range_and_have_their_length(law: Excitation) -> None:
+    signal = law.signal(np.random.default_rng(0), 777, 0.05, U)
+    assert signal.shape == (777,)
+    assert signal.min() >= U.low
+    assert signal.max() <= U.high
+
+
+def test_held_values_last_as_long_as_declared_and_fill_the_range() -> None:
+    signal = HeldRandom(0.1, 0.4).signal(np.random.default_rng(0), 5000, 0.05, U)
+    changes = np.flatnonzero(np.diff(signal)) + 1
+    holds = np.diff(changes)
+    assert (holds.min(), holds.max()) == (2, 8)
+    assert kstest(signal[changes], "uniform", (-1, 4)).pvalue > 1e-3
+
+
+def test_a_multisine_has_its_frequencies_only_and_touches_the_range() -> None:
+    dt, n = 0.05, 2000  # 100 s: 1 and 3 Hz fall on bins
+    signal = Multisine(1.0, 3.0, 2).signal(np.random.default_rng(0), n, dt, U)
+    assert np.isclose(np.abs(signal - 1).max(), 2)
+    power = np.abs(np.fft.rfft(signal - 1)) ** 2
+    power /= power.sum()
+    np.testing.assert_allclose(power[[100, 300]], 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "fragment"),
+    [
+        (lambda: HeldRandom(0.5, 0.1), r"give 0 < shortest <= longest"),
+        (lambda: Multisine(2, 1), r"give 0 < lowest < highest"),
+        (lambda: Multisine(count=1), r"excitation\.count: 1 sines"),
+        (lambda: Multisine(highest=10).signal(np.random.default_rng(0), 9, 0.05, U), r"1/\(2 dt\) = 10 Hz"),
+        (lambda: Simulate(episodes=0), r"simulation\.episodes: 0 is not allowed; give at least 1"),
+        (lambda: Simulate(test_fraction=1), r"simulation\.test_fraction: 1 is not allowed"),
+        (lambda: Simulate(noise_std={"c": -1}), r"simulation\.noise_std\.c: -1 is no standard deviation"),
+        (
+            lambda: Simulate(noise_std={"cc": 1}).run(decay()),
+            r"noise_std\.cc: .*known: c, q\. Did you mean c",
+        ),
+        (lambda: Simulate(truth={"K": 1}).run(decay()), r"simulation\.truth\.K: no such name; known: k, b"),
+        (lambda: Simulate(initial={"u": [0, 1]}).run(decay()), r"simulation\.initial\.u: no such name; known: c"),
+        (lambda: Simulate(initial={"c": [1, 0]}).run(decay()), r"simulation\.initial\.c: \[1, 0\] is no range"),
+        (lambda: Simulate(episodes=1).run(decay()), r"one episode cannot be split .* simulation\.episodes: 2"),
+        (
+            lambda: Simulate(episodes=2).run(decay(dynamics={"c": "c**3"})),
+            r"simulation: c of decay is \S+ at t = \d.* s of episode 0; narrow simulation\.initial",
+        ),
+        (
+            lambda: Simulate().run(decay(states={"t": {"range": [0, 1]}}, dynamics={"t": "-t"}, outputs={"q": "2*t"})),
+            r"decay calls a quantity `t`",
+        ),
+    ],
+)
+def test_errors_name_the_key_and_the_cure(make: Any, fragment: str) -> None:
+    with pytest.raises(ModelError, match=fragment):
+        make()
