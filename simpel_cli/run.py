@@ -194,8 +194,8 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     return record
 
 
-def make_directory(path: Path) -> Path:
-    """Create a run directory and prove that it can be written.
+def make_directory(path: Path, key: str = "hydra.run.dir") -> Path:
+    """Create a directory that the key names, and prove that it can be written.
 
     Raises:
         ConfigError: it cannot.
@@ -207,7 +207,7 @@ def make_directory(path: Path) -> Path:
         probe.unlink()
     except OSError as error:
         raise ConfigError(
-            f"hydra.run.dir: cannot write to {path} ({error.strerror}). Choose another place: hydra.run.dir=DIR."
+            f"{key}: cannot write to {path} ({error.strerror}). Choose another place: {key}=DIR."
         ) from error
     return path
 

@@ -1,14 +1,35 @@
 """`simpel simulate`: a simulator or a MuJoCo world becomes measurements, as Parquet plus card."""
 
-import dataclasses
 from pathlib import Path
-from typing import Any
 
 from simulators.worlds.simulate import Simulate
 
-from simpel_cli.commands.study import source_of
+from simpel_cli.commands.study import settings_of, source_of
 from simpel_cli.config import Job, build, dump
 from simpel_cli.console import Terminal
-from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.errors import ConfigError
 from simpel_cli.records import write_table, write_text
-from simpel_cli.run import Settings, make_directory
+from simpel_cli.run import Manifest, make_directory
+
+
+def simulate(job: Job) -> None:
+    """Simulate and write `measurements.parquet` and `card.yaml`."""
+    settings = settings_of(job.config)
+    out = job.config["out"]
+    directory = make_directory(Path(out) if out else job.directory, "out" if out else "hydra.run.dir")
+    path = directory / "measurements.parquet"
+    if path.exists():
+        raise ConfigError(f"out: {path} exists; remove it, or choose another folder. Nothing was changed.")
+    terminal = Terminal(settings.quiet)
+    simulation = build(job.config["simulation"], "simulation", settings.plugins, default=Simulate)
+    source = source_of(job.config, settings)
+    with Manifest(make_directory(job.directory), "simulate", settings):
+        try:
+            made = simulation.run(source)
+        except ValueError as error:  # simulators.model.ModelError
+            raise ConfigError(str(error)) from error
+        write_table(path, made.columns)
+        write_text(directory / "card.yaml", dump(made.card))
+    rows = len(next(iter(made.columns.values())))
+    terminal.line(f"{path}   {rows} rows: {', '.join(made.columns)}", "data")
+    terminal.line(str(directory / "card.yaml"), "card")
