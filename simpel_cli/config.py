@@ -133,7 +133,8 @@ def _as(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type)
         item = typing.get_args(hint)[1]
         return {k: _convert(v, item, f"{path}.{k}", plugins, owner) for k, v in value.items()}
     if isinstance(value, dict) and (dataclasses.is_dataclass(hint) or getattr(hint, "_is_protocol", False)):
-        return build(value, path, plugins, default=hint if dataclasses.is_dataclass(hint) else None)
+        default = hint if isinstance(hint, type) and dataclasses.is_dataclass(hint) else None
+        return build(value, path, plugins, default=default)
     return _NO
 
 
@@ -226,7 +227,9 @@ def launch(
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
         directory = Path(hydra_config.runtime.output_dir)
-        own = " ".join(w.removeprefix("++") for w in hydra_config.overrides.task if w.removeprefix("++") not in overrides)
+        own = " ".join(
+            w.removeprefix("++") for w in hydra_config.overrides.task if w.removeprefix("++") not in overrides
+        )
         return task(Job(typing.cast(dict[str, Any], plain), directory, folder, own))
 
     # our own exceptions pass through; what Hydra and OmegaConf raise is translated
@@ -334,7 +337,9 @@ def _translate(error: Exception, verb: str) -> str:
     if found := re.search(r"Could not override '([\w.@/]+)'", text):
         return f"{found[1]}: no such key or group of `simpel {verb}`.{did_you_mean(found[1], _top_level(verb))}"
     if found := re.search(r"Error parsing override '(.*)'", text):
-        return f"{found[1]}: not of the form key=value ({text.splitlines()[-1].strip() or text.splitlines()[1].strip()})."
+        return (
+            f"{found[1]}: not of the form key=value ({text.splitlines()[-1].strip() or text.splitlines()[1].strip()})."
+        )
     lines = [line.strip() for line in [*str(cause or "").splitlines(), *text.splitlines()] if line.strip()]
     key = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
     return f"{key + ': ' if key else ''}{lines[0] if lines else text}"

@@ -20,7 +20,6 @@ LEVELS = np.arange(0.05, 0.951, 0.05)
 CHUNK = 512  # test inputs per call: one compiled program serves every test set
 
 
-
 class Posterior(NamedTuple):
     """A fitted posterior of one seed, as functions of arrays in data units.
 
@@ -104,7 +103,7 @@ def _with_sum(a: np.ndarray) -> np.ndarray:
 class Blocks(NamedTuple):
     """Resampling units: whole episodes where there are enough, else contiguous pieces of them."""
 
-    index: np.ndarray  # (n,) block of every point
+    of_point: np.ndarray  # (n,) block of every point
     kind: str
 
 
@@ -145,11 +144,11 @@ def bootstrap(
 
     Reference: Efron and Tibshirani (1993), section 13.3.
     """
-    n_blocks = int(blocks.index.max()) + 1
+    n_blocks = int(blocks.of_point.max()) + 1
     flat = points.reshape(len(points), -1)
     sums = np.zeros((n_blocks, flat.shape[1]))
-    np.add.at(sums, blocks.index, flat)
-    sizes = np.bincount(blocks.index, minlength=n_blocks).astype(float)
+    np.add.at(sums, blocks.of_point, flat)
+    sizes = np.bincount(blocks.of_point, minlength=n_blocks).astype(float)
     rng = np.random.default_rng(0)  # resampling noise is no part of an experiment's seed
     counts = rng.multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=resamples).astype(float)
     means = (counts @ sums) / (counts @ sizes)[:, None]
@@ -207,9 +206,7 @@ def windows(episodes: tuple[Episode, ...], horizon: int, first: int) -> list[tup
     return starts
 
 
-def free_run(
-    posterior: Posterior, encoding: Encoding, episodes: tuple[Episode, ...], horizon: int
-) -> FreeRun | None:
+def free_run(posterior: Posterior, encoding: Encoding, episodes: tuple[Episode, ...], horizon: int) -> FreeRun | None:
     """Roll the posterior out from measured states; each particle follows its own path (trajectory sampling TS-infinity).
 
     Reference: Chua, Calandra, McAllister and Levine (2018), Deep reinforcement learning in a handful of trials.

@@ -14,16 +14,18 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.predictive import Predictive
 
+Numbers = Array | np.ndarray  # assembled on the host, read by compiled programs
+
 
 class Normaliser(NamedTuple):
     """Affine maps between data units and the units in which networks work."""
 
-    x_mean: Float[Array, " dx"]
-    x_std: Float[Array, " dx"]
-    y_mean: Float[Array, " dy"]
-    y_std: Float[Array, " dy"]
+    x_mean: Float[Numbers, " dx"]
+    x_std: Float[Numbers, " dx"]
+    y_mean: Float[Numbers, " dy"]
+    y_std: Float[Numbers, " dy"]
 
-    def x(self, x: Float[Array, "n dx"]) -> Float[Array, "n dx"]:
+    def x(self, x: Float[Numbers, "n dx"]) -> Float[Array, "n dx"]:
         """Normalise network inputs."""
         return (x - self.x_mean[None]) / self.x_std[None]
 
@@ -38,8 +40,8 @@ class Bank(NamedTuple):
     The first rows belong to the (padded) training inputs, in their order.
     """
 
-    x: Float[Array, "B dx"]
-    samples: Float[Array, "B dy N"]
+    x: Float[Numbers, "B dx"]
+    samples: Float[Numbers, "B dy N"]
 
 
 class Problem(NamedTuple):
@@ -49,12 +51,12 @@ class Problem(NamedTuple):
     targets `y`, `gap_scale` and `noise_init` in normalised output units.
     """
 
-    x: Float[Array, "m_padded dx"]
-    y: Float[Array, "m_padded dy"]
-    m: Int[Array, ""]
+    x: Float[Numbers, "m_padded dx"]
+    y: Float[Numbers, "m_padded dy"]
+    m: Int[Numbers, ""]
     normaliser: Normaliser
-    gap_scale: Float[Array, " dy"]
-    noise_init: Float[Array, " dy"]
+    gap_scale: Float[Numbers, " dy"]
+    noise_init: Float[Numbers, " dy"]
     bank: Bank | None = None
 
 
@@ -70,7 +72,7 @@ class PriorProcess(Protocol):
         """Draw the simulator part at inputs in data units; data units out."""
         ...
 
-    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array, " dy"]) -> Float[Array, "dy M M"]:
+    def covariance(self, x: Float[Array, "M dx"], scale: Float[Numbers, " dy"]) -> Float[Array, "dy M M"]:
         """Covariance of the Gaussian part at normalised inputs, in normalised output units."""
         ...
 
@@ -121,6 +123,21 @@ class Method(Protocol):
         """Number of steps to take."""
         ...
 
+    @property
+    def particles(self) -> int:
+        """Number of members of the posterior, L."""
+        ...
+
+    @property
+    def pool(self) -> int:
+        """Number of domain points that a stretch of steps chooses from."""
+        ...
+
+    @property
+    def noise(self) -> "NoiseModel":
+        """Observation noise."""
+        ...
+
     def bind(self, setting: Setting, problem: Problem) -> Inference:
         """Return the rule for this problem; called while tracing, so that arrays stay arguments of the program."""
         ...
@@ -142,14 +159,17 @@ class NoiseModel:
         floor: smallest standard deviation when learned.
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.
+        rate: its learning rate as a multiple of the networks'. One number per output has far less to learn than a
+            network, but at the same rate it needs thousands of steps per decade.
     """
 
     learn: bool = True
     floor: float = 1e-3
     prior_std: float = 1.0
     least_init: float = 0.1
+    rate: float = 10.0
 
-    def init(self, sigma: Float[Array, " dy"]) -> Float[Array, " dy"]:
+    def init(self, sigma: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return rho for a standard deviation."""
         # inverse softplus, written so that it does not overflow for large arguments
         above = jnp.maximum(sigma - self.floor, 1e-6)
@@ -159,7 +179,7 @@ class NoiseModel:
         """Return sigma."""
         return self.floor + jax.nn.softplus(rho)
 
-    def log_prior(self, rho: Float[Array, " dy"], sigma_init: Float[Array, " dy"]) -> Float[Array, ""]:
+    def log_prior(self, rho: Float[Array, " dy"], sigma_init: Float[Numbers, " dy"]) -> Float[Array, ""]:
         """Log density of log sigma, up to a constant."""
         z = (jnp.log(self.std(rho)) - jnp.log(sigma_init)) / self.prior_std
         return -0.5 * jnp.sum(z * z)

@@ -20,11 +20,16 @@ app = typer.Typer(
     help="Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems.",
 )
 
-Overrides = Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.")]
-ConfigDir = Annotated[
-    Path | None, typer.Option("--config-dir", "-cd", help="Folder with groups of your own: sim/, data/, experiment/, ...")
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.")
 ]
-Cfg = Annotated[str | None, typer.Option("--cfg", help="Print the composed configuration (`--cfg job`) and do nothing.")]
+ConfigDir = Annotated[
+    Path | None,
+    typer.Option("--config-dir", "-cd", help="Folder with groups of your own: sim/, data/, experiment/, ..."),
+]
+Cfg = Annotated[
+    str | None, typer.Option("--cfg", help="Print the composed configuration (`--cfg job`) and do nothing.")
+]
 Multirun = Annotated[bool, typer.Option("--multirun", "-m", help="Run every combination of comma-separated values.")]
 
 
@@ -39,7 +44,6 @@ def fit(
     """Fit a model to measured transitions, with a simulator as prior.
 
     Examples:
-
       simpel fit experiment=pendulum
 
       simpel fit --config-dir my sim=rig data=rig data.n_train=50 run.seeds=5
@@ -64,7 +68,6 @@ def evaluate(
     """Judge a fitted model on held-out or other measurements.
 
     Examples:
-
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9
 
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9 --config-dir my data=rig
@@ -80,7 +83,6 @@ def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = 
     """Fit every combination of values and collect the results.
 
     Examples:
-
       simpel sweep experiment=pendulum method=simpel,fsvgd data.n_train=10,20,40 'run.seed=range(3)'
 
       simpel sweep --config-dir my sim=rig data=rig data.n_train=20,80 'run.seed=range(5)'
@@ -95,7 +97,6 @@ def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg
     """Turn a simulator or a MuJoCo world into measurements: Parquet and card.
 
     Examples:
-
       simpel simulate sim=pendulum_world out=data/pendulum
 
       simpel simulate --config-dir my sim=rig simulation.episodes=20 simulation.seed=1 out=my/data/rig
@@ -105,7 +106,7 @@ def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg
     _launch("simulate", command.simulate, overrides, config_dir, cfg, [])
 
 
-def _launch(verb, task, overrides, config_dir, cfg, flags) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
+def _launch(verb, task, overrides, config_dir, cfg, flags) -> None:  # type: ignore[no-untyped-def]
     from simpel_cli.config import launch
 
     launch(verb, task, overrides or [], config_dir=config_dir, flags=[*flags, *(["--cfg", cfg] if cfg else [])])

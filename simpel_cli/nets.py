@@ -1,6 +1,7 @@
 """Multilayer perceptrons, written for one particle and one input; vmap at the boundary."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ class MLP:
         sizes = (dim_in, *self.hidden, dim_out)
         keys = jax.random.split(key, 2 * (len(sizes) - 1))
         layers = []
-        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             if i < len(self.hidden):
                 bound = (6.0 / fan_in) ** 0.5
                 kernel = jax.random.uniform(keys[2 * i], (fan_in, fan_out), dtype, -bound, bound)

@@ -103,10 +103,14 @@ def _predictions(path: Path) -> Any:
             table[c][own][order] for c in ("time", "mean", "std", "epistemic_std", "measured")
         )
         axis.fill_between(t, mean - 2 * std, mean + 2 * std, color=COLOURS[0], alpha=0.15, label="±2 std, total")
-        axis.fill_between(t, mean - 2 * between, mean + 2 * between, color=COLOURS[0], alpha=0.35, label="±2 std, model")
+        axis.fill_between(
+            t, mean - 2 * between, mean + 2 * between, color=COLOURS[0], alpha=0.35, label="±2 std, model"
+        )
         axis.plot(t, mean, color=COLOURS[0], linewidth=1.2, label="predicted")
         axis.plot(t, measured, ".", color=COLOURS[1], markersize=3, label="measured")
-        axis.set(title=f"change of {output} in one step", xlabel="time [s]", ylabel=_label(output, table["unit"][own][0]))
+        axis.set(
+            title=f"change of {output} in one step", xlabel="time [s]", ylabel=_label(output, table["unit"][own][0])
+        )
     axes[0].legend(fontsize=7, frameon=False)
     return figure
 
@@ -122,7 +126,13 @@ def _calibration(path: Path) -> Any:
         width = 2.0 if output == "joint" else 1.2
         colour = "black" if output == "joint" else COLOURS[j % 6]
         axis.plot(levels, fraction, marker=".", markersize=4, linewidth=width, color=colour, label=output)
-    axis.set(title="calibration", xlabel="stated probability", ylabel="share of test targets inside", xlim=(0, 1), ylim=(0, 1))
+    axis.set(
+        title="calibration",
+        xlabel="stated probability",
+        ylabel="share of test targets inside",
+        xlim=(0, 1),
+        ylim=(0, 1),
+    )
     axis.text(0.97, 0.05, "below the diagonal: overconfident", ha="right", fontsize=7, color="0.4")
     axis.legend(fontsize=7, frameon=False)
     return figure
@@ -138,7 +148,9 @@ def _horizon(path: Path) -> Any:
             alpha = 0.9 if i == 0 else 0.4
             label = ("error (RMSE)", "claimed std") if i == 0 else (None, None)
             axis.plot(table["horizon"][own], table["rmse"][own], color=COLOURS[1], alpha=alpha, label=label[0])
-            axis.plot(table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1])
+            axis.plot(
+                table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1]
+            )
         unit = table["unit"][table["output"] == output][0]
         axis.set(title=f"free run, {output}", xlabel="time ahead [s]", ylabel=_label(output, unit), ylim=(0, None))
     axes[0].legend(fontsize=7, frameon=False)

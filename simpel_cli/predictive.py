@@ -1,6 +1,6 @@
 """The predictive distribution: an equal-weight mixture of one Gaussian per particle.
 
-    p(y | x) = 1/L sum_l prod_i N(y_i; h_li(x), sigma_i^2)
+p(y | x) = 1/L sum_l prod_i N(y_i; h_li(x), sigma_i^2)
 """
 
 from typing import NamedTuple
@@ -60,8 +60,8 @@ class Predictive(NamedTuple):
         """
         sigma = self.noise_std[None]
 
-        def spread(l: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-            return jnp.mean(_expected_abs(l[None] - self.particles, 2**0.5 * sigma[None]), axis=0)
+        def spread(member: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+            return jnp.mean(_expected_abs(member[None] - self.particles, 2**0.5 * sigma[None]), axis=0)
 
         to_data = jnp.mean(_expected_abs(y[None] - self.particles, sigma[None]), axis=0)
         between = jnp.mean(jax.lax.map(spread, self.particles), axis=0)

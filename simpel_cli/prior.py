@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from simulators.model import Quantity
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.gp import Kernel, SquaredExponential, gram
 from simpel_cli.transition import OneStep, Transition
+from simulators.model import Quantity
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class GapGP:
         kernel: correlation function.
         lengthscale: in normalised inputs (unit variance on the domain), or in data units; null = 2 sqrt(dx) normalised.
         lengthscale_units: `normalised` or `raw`.
-        scale: kappa, the standard deviation per output. `declared` takes `gap:` of the simulator and `auto` for what it
-            leaves out; `auto` maximises the marginal likelihood of the training transitions; a number is a fraction of
-            the outputs' normalising standard deviation.
+        scale: kappa, the standard deviation per output. `auto` maximises the marginal likelihood of the training
+            transitions; `declared` takes `gap:` of the simulator, and `auto` for what it leaves out; a number is a
+            fraction of the outputs' normalising standard deviation.
     """
 
     kernel: Kernel = SquaredExponential()
     lengthscale: float | None = None
     lengthscale_units: str = "normalised"
-    scale: float | str = "declared"
+    scale: float | str = "auto"
 
     def __post_init__(self) -> None:
         if self.lengthscale_units not in ("normalised", "raw"):
@@ -77,9 +77,10 @@ class FunctionPrior(NamedTuple):
         if self.step is None:
             return jnp.zeros((n, x.shape[0], self.dim_y), x.dtype)
         phi = sample_parameters(key, self.params, n, x.dtype)
-        return jax.vmap(lambda p: jax.vmap(self.step, in_axes=(0, None))(x, p))(phi)
+        at_all_inputs = jax.vmap(self.step, in_axes=(0, None))
+        return jax.vmap(at_all_inputs, in_axes=(None, 0))(x, phi)
 
-    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array, " dy"]) -> Float[Array, "dy M M"]:
+    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array | np.ndarray, " dy"]) -> Float[Array, "dy M M"]:
         """Covariance of the Gaussian part; the correlation matrix is shared by the outputs."""
         white = self.white_variance * jnp.eye(x.shape[0], dtype=x.dtype)
         if self.kernel is None:
@@ -137,6 +138,7 @@ class GPPrior:
     white_variance: float = 1e-3
 
     uses_simulator = False
+    draws = 2  # two zero draws: mean and covariance of the (absent) simulator part are exactly zero
 
     @property
     def gap(self) -> GapGP:
@@ -145,8 +147,9 @@ class GPPrior:
 
     def bind(self, system: Transition | None, dim_x: int, dim_y: int, x_std: np.ndarray) -> FunctionPrior:
         """Bind to the dimensions of a system; its simulator is not used."""
-        # two zero draws: mean and covariance of the (absent) simulator part are exactly zero
-        return FunctionPrior(2, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, dim_y)
+        return FunctionPrior(
+            self.draws, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, dim_y
+        )
 
 
 def _input_scale(gap: GapGP, x_std: np.ndarray) -> np.ndarray:

@@ -10,9 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
-from simulators.model import Model
-from simulators.parameters import draw
-from simulators.worlds.world import World
 
 from simpel_cli.domain import Domain
 from simpel_cli.encoding import Encoding
@@ -21,6 +18,9 @@ from simpel_cli.gap import marginal_likelihood_scale
 from simpel_cli.inference import Bank, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
 from simpel_cli.transition import Transition, encoding_of, transition
+from simulators.model import Model
+from simulators.parameters import draw
+from simulators.worlds.world import World
 
 NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
 SCALE_POINTS, SCALE_DRAWS = 128, 512
@@ -47,6 +47,7 @@ class System(NamedTuple):
         if self.transition is not None:
             prior = SimulatorPrior(gap=None).bind(self.transition, *self.dims, np.ones(self.encoding.dim_x))
             return np.asarray(jax.jit(prior.simulate, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
+        assert not isinstance(self.source, Model)
         return query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
 
     @property
@@ -144,7 +145,7 @@ def assemble(
     """
     dtype = jnp.dtype(precision)
     encoding = system.encoding
-    bound = prior.bind(system.transition, *system.dims, normaliser.x_std)
+    bound = prior.bind(system.transition, *system.dims, np.asarray(normaliser.x_std))
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
     noise_init = np.maximum(sigma, least_noise)
     problems, scales = [], []
@@ -156,7 +157,7 @@ def assemble(
         arrays = Problem(
             x=pad_rows(x, length),
             y=pad_rows(targets, length),
-            m=np.int32(len(x)),
+            m=np.array(len(x), np.int32),
             normaliser=normaliser,
             gap_scale=scale,
             noise_init=noise_init,
@@ -174,9 +175,7 @@ def assemble(
     return Assembled(setting, jax.tree.map(stack, *problems), gap_scale)
 
 
-def _bank(
-    prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: int, key: PRNGKeyArray
-) -> Bank | None:
+def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: int, key: PRNGKeyArray) -> Bank | None:
     """Query a world once: at the training inputs and at a pool of domain points."""
     if system.transition is not None or not prior.uses_simulator:
         return None

@@ -70,7 +70,9 @@ class MetricStream:
     def __init__(self, directory: Path, constants: dict[str, Any], *, resume_at: int | None = None) -> None:
         self.directory, self.constants = directory, constants
         self.path = directory / "metrics.jsonl"
-        kept = [] if resume_at is None else [r for r in self._read() if r["split"] == "train" and r["step"] <= resume_at]
+        kept = (
+            [] if resume_at is None else [r for r in self._read() if r["split"] == "train" and r["step"] <= resume_at]
+        )
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in kept))
         self._file = self.path.open("a")
 

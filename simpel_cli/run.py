@@ -100,7 +100,9 @@ def cache_directory() -> Path:
     try:
         return (Path(root) if root else Path.home() / ".cache") / "simpel"
     except RuntimeError as error:  # no home directory
-        raise ConfigError("no home directory: set XDG_CACHE_HOME, or switch the cache off with run.cache=false.") from error
+        raise ConfigError(
+            "no home directory: set XDG_CACHE_HOME, or switch the cache off with run.cache=false."
+        ) from error
 
 
 def stream(seed: int, name: str) -> "PRNGKeyArray":

@@ -1,6 +1,6 @@
 """The one-step map of a simulator in the coordinates of the learning problem, for one point.
 
-    (x, phi) -> y = [enc(F(s, u; phi)) - enc(s), g(s, u; phi)],   F = RK4 of the model over dt
+(x, phi) -> y = [enc(F(s, u; phi)) - enc(s), g(s, u; phi)],   F = RK4 of the model over dt
 """
 
 from collections.abc import Callable
@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from simulators.model import Model, Quantity
 
 from simpel_cli.casadi_jax import checked
 from simpel_cli.encoding import Encoding
 from simpel_cli.integrate import rk4
+from simulators.model import Model, Quantity
+from simulators.worlds.world import World
 
 OneStep = Callable[[Float[Array, " dx"], Float[Array, " dp"]], Float[Array, " dy"]]
 
@@ -26,7 +27,7 @@ class Transition(NamedTuple):
     step: OneStep
 
 
-def encoding_of(model: Model, outputs: tuple[str, ...] = (), stack: int = 0) -> Encoding:
+def encoding_of(model: Model | World, outputs: tuple[str, ...] = (), stack: int = 0) -> Encoding:
     """Return the coordinates of a model whose named outputs are measured."""
     measured = tuple(q for q in model.outputs if q.name in outputs)
     return Encoding(states=model.states, inputs=model.inputs, outputs=measured, stack=stack)

@@ -26,7 +26,9 @@ def evaluate(job: Job) -> None:
     directory = make_directory(job.directory)
     own = resolved(job)
     config = trained | {k: own[k] for k in ("evaluation",) if own.get(k)}
-    config["run"] = trained["run"] | {k: own["run"][k] for k in ("quiet", "device", "cache") if k in (own.get("run") or {})}
+    config["run"] = trained["run"] | {
+        k: own["run"][k] for k in ("quiet", "device", "cache") if k in (own.get("run") or {})
+    }
     write_text(directory / "config.yaml", dump(config | ({"judged_on": own["data"]} if own.get("data") else {})))
     with Manifest(directory, "evaluate", settings_of(config)) as manifest:
         study = open_study(config, run)
@@ -35,7 +37,9 @@ def evaluate(job: Job) -> None:
         judged_on = study
         if own.get("data"):
             choices = trained["choices"] | {"data": own["choices"].get("data", "")}
-            judged_on = open_study(config | {"data": own["data"] | {"n_train": None}, "choices": choices}, job.data_folder)
+            judged_on = open_study(
+                config | {"data": own["data"] | {"n_train": None}, "choices": choices}, job.data_folder
+            )
             if judged_on.system.encoding != study.system.encoding:
                 raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
         manifest.add_inputs(judged_on.recording.files)
@@ -44,7 +48,5 @@ def evaluate(job: Job) -> None:
         terminal.line(f"simpel evaluate · {run} · step {step} · {judged_on.recording.files[0]}", style="bold")
         judged = judge(judged_on, posteriors(study, fitted.assembled, state), directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
-        write_metrics(
-            directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])}
-        )
+        write_metrics(directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])})
         publish(terminal, judged_on, judged, directory, dump(config), "evaluate", run)

@@ -21,7 +21,8 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
     method, score = study.choices.get("method", ""), study.choices.get("score", "")
     seeds = f"seed {s.seed}" if s.seeds == 1 else f"seeds {s.seed}..{s.seed + s.seeds - 1}"
     terminal.line(
-        f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}", style="bold"
+        f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}",
+        style="bold",
     )
     failed = [c for c in recording.checks if not c.ok]
     terminal.line(
@@ -41,7 +42,7 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
 
 def _gap_text(study: Study, fitted: Fitted) -> str:
     gap = study.prior.gap
-    if gap is None:
+    if gap is None or fitted.assembled.gap_scale is None:
         return "no gap GP"
     words = "".join(f" {c.lower()}" if c.isupper() else c for c in type(gap.kernel).__name__).strip()
     length = gap.lengthscale if gap.lengthscale is not None else 2 * study.system.encoding.dim_x**0.5
@@ -51,7 +52,13 @@ def _gap_text(study: Study, fitted: Fitted) -> str:
 
 
 def publish(
-    terminal: Terminal, study: Study, judged: Judged, directory: Path, config: str, command: str, source: Path | None = None
+    terminal: Terminal,
+    study: Study,
+    judged: Judged,
+    directory: Path,
+    config: str,
+    command: str,
+    source: Path | None = None,
 ) -> None:
     """Print the test results, draw the figures, write the report, and say where things lie and what to type next."""
     values = _by_metric(judged.rows)
@@ -145,7 +152,9 @@ def _aligned(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     """Columns of equal width, for terminals."""
     cells = [head, *rows]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join("  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells)
+    return "\n".join(
+        "  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells
+    )
 
 
 def _next(study: Study, directory: Path, command: str, source: Path | None) -> list[str]:

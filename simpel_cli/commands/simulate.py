@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-from simulators.worlds.simulate import Simulate
-
 from simpel_cli.commands.study import settings_of, source_of
 from simpel_cli.config import Job, build, dump
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
 from simpel_cli.records import write_table, write_text
 from simpel_cli.run import Manifest, make_directory
+from simulators.worlds.simulate import Simulate
 
 
 def simulate(job: Job) -> None:

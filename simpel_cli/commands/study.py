@@ -132,12 +132,13 @@ def prepare(study: Study) -> Fitted:
     settings, measurements = study.settings, study.measurements
     pairs = transitions(study.recording.train, measurements.stack_actions)
     training = [
-        test_arrays(select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding)
+        test_arrays(
+            select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding
+        )
         for seed in settings.all_seeds
     ]
     # one normaliser for all seeds and all n_train: results stay comparable
     normaliser = normaliser_of(study.system, stream(0, "normaliser"))
-    noise = getattr(study.method, "noise", None)
     assembled = assemble(
         study.system,
         normaliser,
@@ -145,8 +146,8 @@ def prepare(study: Study) -> Fitted:
         study.score,
         training,
         study.recording.noise_std,
-        least_noise=noise.least_init if noise is not None else 0.1,
-        pool=getattr(study.method, "pool", 0),
+        least_noise=study.method.noise.least_init,
+        pool=study.method.pool,
         keys=[stream(seed, "prior") for seed in settings.all_seeds],
         precision=settings.precision,
     )
@@ -168,14 +169,13 @@ def posteriors(study: Study, assembled: Assembled, state: Any) -> list[Posterior
     predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
     members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
     dtype = assembled.problems.x.dtype
-    result = []
-    for i in range(study.settings.seeds):
-        problem, own = jax.tree.map(lambda a, i=i: a[i], (assembled.problems, state))
-        result.append(
-            Posterior(
-                predict=lambda x, p=problem, s=own: predict(p, s, jnp.asarray(x, dtype)),
-                members=lambda x, p=problem, s=own: members(p, s, jnp.asarray(x, dtype)),
-                particles=study.method.particles,
-            )
+
+    def of_seed(i: int) -> Posterior:
+        problem, own = jax.tree.map(lambda a: a[i], (assembled.problems, state))
+        return Posterior(
+            predict=lambda x: predict(problem, own, jnp.asarray(x, dtype)),
+            members=lambda x: members(problem, own, jnp.asarray(x, dtype)),
+            particles=study.method.particles,
         )
-    return result
+
+    return [of_seed(i) for i in range(study.settings.seeds)]

@@ -114,7 +114,7 @@ def _work(job: Job) -> Outcome:
         fit(job)
     except SimpelError as error:
         return Outcome(job.directory, error.exit_code, str(error))
-    except Exception:  # noqa: BLE001 (a bug in one job must not lose the sweep; its traceback is kept)
+    except Exception:
         text = traceback.format_exc()
         (job.directory / "traceback.txt").write_text(text)
         return Outcome(job.directory, 1, f"{text.splitlines()[-1]} (see traceback.txt in its directory)")

@@ -96,7 +96,6 @@ class FSVGD:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
         to_normalised = problem.normaliser
         dtype = problem.x.dtype
-        x_train = to_normalised.x(problem.x)
         n_rows, dim_x = problem.x.shape
         dim_y = problem.y.shape[1]
         optimiser = optax.adamw(self.learning_rate, weight_decay=self.weight_decay, mask=(True, False))
@@ -109,11 +108,11 @@ class FSVGD:
 
         def draw(key: PRNGKeyArray) -> Draws:
             if problem.bank is not None:
-                x, samples = problem.bank
+                x, samples = jnp.asarray(problem.bank.x), jnp.asarray(problem.bank.samples)
             else:
                 key_x, key_phi = jax.random.split(key)
                 fresh = setting.sample_inputs(key_x, self.pool)
-                x = jnp.concatenate([problem.x, fresh])
+                x = jnp.concatenate([jnp.asarray(problem.x), fresh])
                 samples = jnp.moveaxis(setting.prior.simulate(key_phi, x, setting.prior.draws), 0, -1)
             scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
             return Draws(to_normalised.x(x), scaled)
@@ -150,7 +149,8 @@ class FSVGD:
             descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
             with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
                 updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
-            particles, noise = optax.apply_updates((state.particles, state.noise), updates)
+            particles = optax.apply_updates(state.particles, updates[0])
+            noise = state.noise + self.noise.rate * updates[1]
             info = Info(-log_likelihood / (b * self.particles), self.noise.std(state.noise), mean_kernel)
             return State(particles, noise, opt_state), info
 
@@ -175,9 +175,7 @@ class FSVGD:
         return Inference(init, draw, step, predict, members)
 
 
-def _log_likelihood(
-    h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"]
-) -> Float[Array, ""]:
+def _log_likelihood(h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"]) -> Float[Array, ""]:
     """Sum over particles, points and outputs of log N(y; h, sigma^2), up to a constant."""
     z = (y[None] - h) / sigma[None, None]
     return jnp.sum(-0.5 * z * z - jnp.log(sigma)[None, None])

@@ -1,0 +1,54 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+SHELL := /bin/bash
+VENV ?= .venv
+BIN := $(VENV)/bin
+UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
+STAMP := $(VENV)/.installed
+WORKERS ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow lint format bench lock data clean
+
+help: ## Show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-12s\033[0m %s\n", $$1, $$2}'
+
+install: $(STAMP) ## Set up .venv from the lock (brings uv along if it is not there)
+
+$(STAMP): pyproject.toml uv.lock
+	@test -x $(BIN)/python || python3 -m venv $(VENV)
+	@command -v uv >/dev/null 2>&1 || test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet uv
+	@# --inexact keeps the uv that was just put into the environment
+	VIRTUAL_ENV=$(VENV) $(UV) sync --frozen --inexact --active --quiet
+	@touch $@
+
+demo: install ## Run the main job (simpel fit experiment=pendulum) and say where the report lies
+	$(BIN)/simpel fit experiment=pendulum
+
+test: install ## Run the tests (under 12 minutes on two cores)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+test-slow: install ## Run the long studies that `make test` leaves out
+	$(BIN)/python -m pytest -m slow
+
+lint: install ## Format, lint, layers, types, lock
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+	$(UV) lock --check --no-config
+
+format: install ## Format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
+	$(BIN)/python -m tests.benchmarks.reference
+
+lock: ## Write uv.lock against the public index only
+	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config
+
+data: install ## Make the measurements in data/ anew
+	rm -rf data/pendulum && $(BIN)/simpel simulate simulation=pendulum out=data/pendulum
+
+clean: ## Remove what make made
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .import_linter_cache dist build

@@ -1,0 +1,119 @@
+"""Scores and times on the published reference's own pendulum arrays (SIMPEL_SHARED/reference).
+
+    python -m tests.benchmarks.reference                  # every set and method, 5 seeds
+    python -m tests.benchmarks.reference --sets pendulum_n20_s0 --methods simpel --seeds 1
+
+Settings are the published ones (simulator pendulum_published, gap GP l = 10 raw with the declared scales, N = 1028,
+L = 20, 3 x 64, 32 + 8 points); steps are the reference's (5000 at 20 transitions, 7000 at 320).
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+
+from simpel_cli import loop
+from simpel_cli.commands.study import STRETCH
+from simpel_cli.config import build, conf_dir
+from simpel_cli.evaluation import Posterior, one_step
+from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.problem import assemble, normaliser_of, system_of
+from simpel_cli.run import Settings, configure, stream
+from simpel_cli.scores.gaussian import Gaussian
+
+SETS = {"pendulum_n20_s0": 5000, "pendulum_n20_s1": 5000, "pendulum_n320_s0": 7000, "pendulum_n320_s1": 7000}
+METHODS = ("simpel", "simpel_only_sim", "fsvgd")
+NOISE = {"phi": 0.02, "omega": 0.02}  # of the arrays, per output component
+
+
+def node(group: str, name: str) -> dict:
+    return {
+        k: v for k, v in yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text()).items() if k != "defaults"
+    }
+
+
+def prior_of(method: str, scale: str | float) -> SimulatorPrior | GPPrior:
+    if method == "fsvgd":
+        return build(node("prior", "gp"), "prior")
+    gap = GapGP(lengthscale=10.0, lengthscale_units="raw", scale=scale) if method == "simpel" else None
+    return SimulatorPrior(gap=gap)
+
+
+def fit(arrays: dict, method: str, steps: int, seeds: int, scale: str | float, overrides: dict) -> dict:
+    began = time.perf_counter()
+    declared = build(node("sim", "pendulum_published"), "sim").model()
+    system = system_of(declared, (), 0)
+    normaliser = normaliser_of(system, stream(0, "normaliser"))
+    rule = build(node("method", method) | {"steps": steps} | overrides, "method")
+    pair = (np.asarray(arrays["x_train"], float), np.asarray(arrays["y_train_diff"], float))
+    assembled = assemble(
+        system, normaliser, prior_of(method, scale), Gaussian(), [pair] * seeds, NOISE,
+        least_noise=rule.noise.least_init, pool=rule.pool, keys=[stream(s, "prior") for s in range(seeds)], precision="float32",
+    )  # fmt: skip
+    keys = jnp.stack([stream(s, "train") for s in range(seeds)])
+    bind = lambda problem: rule.bind(assembled.setting, problem)  # noqa: E731
+    program = loop.compiled(bind, assembled.problems, keys, STRETCH)
+    laps = [time.perf_counter()]
+    state = None
+    for stretch in loop.train(program, steps):
+        state = stretch.state
+        laps.append(time.perf_counter())
+    predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
+    nll, rmse, crps, inside = [], [], [], []
+    for i in range(seeds):
+        problem, own = jax.tree.map(lambda a, i=i: a[i], (assembled.problems, state))
+        posterior = Posterior(
+            lambda x, p=problem, s=own: predict(p, s, jnp.asarray(x, jnp.float32)), None, rule.particles
+        )
+        result = one_step(posterior, np.asarray(arrays["x_test"], float), np.asarray(arrays["y_test_diff"], float))
+        nll.append(result.nll[:, -1].mean())
+        rmse.append(np.sqrt(result.squared[:, -1].mean()))
+        crps.append(result.crps[:, -1].mean())
+        inside.append(result.inside[:, :-1].mean())
+    per_step = float(np.median(np.diff(laps))) / STRETCH * 1e3
+    return {
+        "nll": nll, "rmse": rmse, "crps": crps, "coverage_90": inside, "ms_per_step": per_step / seeds,
+        "compile_s": program.compile_seconds, "fit_s": time.perf_counter() - began,
+        "kappa": None if assembled.gap_scale is None else assembled.gap_scale.tolist(),
+        "noise_std": np.asarray(stretch.info.noise_std[:, -1].mean(0) * normaliser.y_std).tolist(),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", nargs="+", default=list(SETS))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--gap-scale", default="declared", help="declared, auto or a number")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=JSON", help="fields of the method")
+    options = parser.parse_args()
+    configure(Settings())
+    folder = Path(os.environ.get("SIMPEL_SHARED", "../shared")) / "reference"
+    published = json.loads((folder / "scores.json").read_text())
+    overrides = {k: json.loads(v) for k, v in (word.split("=", 1) for word in options.set)}
+    print(
+        "| set | method | NLL | RMSE | CRPS | coverage 90 % | ms/step/seed | compile s | whole s | reference NLL / RMSE |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for name in options.sets:
+        arrays = dict(np.load(folder / f"{name}.npz"))
+        for method in options.methods:
+            r = fit(arrays, method, SETS[name], options.seeds, options.gap_scale, overrides)
+            spread = {k: f"{np.mean(r[k]):.3f} ± {np.std(r[k]):.3f}" for k in ("nll", "rmse", "crps", "coverage_90")}
+            reference = published[name][method]
+            print(
+                f"| {name} | {method} | {spread['nll']} | {spread['rmse']} | {spread['crps']} | {spread['coverage_90']} "
+                f"| {r['ms_per_step']:.2f} | {r['compile_s']:.1f} | {r['fit_s']:.1f} "
+                f"| {reference['nll']:.2f} / {reference['rmse']:.3f} |  kappa {r['kappa']} noise {r['noise_std']}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
