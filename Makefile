@@ -2,7 +2,8 @@
 SHELL := /bin/bash
 VENV ?= .venv
 BIN := $(VENV)/bin
-UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
+UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
+PYTHON ?= python3
 STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
@@ -15,10 +16,8 @@ help: ## Show this list
 install: $(STAMP) ## Set up .venv from the lock (brings uv along if it is not there)
 
 $(STAMP): pyproject.toml uv.lock
-	@test -x $(BIN)/python || python3 -m venv $(VENV)
-	@command -v uv >/dev/null 2>&1 || test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet uv
-	@# --inexact keeps the uv that was just put into the environment
-	VIRTUAL_ENV=$(VENV) $(UV) sync --frozen --inexact --active --quiet
+	@command -v $(UV) >/dev/null || { $(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet uv; }
+	UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never $(UV) sync --frozen --quiet --python $(PYTHON)
 	@touch $@
 
 demo: install ## Run the main job (simpel fit experiment=pendulum) and say where the report lies
@@ -51,4 +50,4 @@ data: install ## Make the measurements in data/ anew
 	rm -rf data/pendulum && $(BIN)/simpel simulate simulation=pendulum out=data/pendulum
 
 clean: ## Remove what make made
-	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .import_linter_cache dist build
+	rm -rf $(VENV) .uv .pytest_cache .ruff_cache .mypy_cache .import_linter_cache dist build

@@ -27,7 +27,7 @@ class Normaliser(NamedTuple):
 
     def x(self, x: Float[Numbers, "n dx"]) -> Float[Array, "n dx"]:
         """Normalise network inputs."""
-        return (x - self.x_mean[None]) / self.x_std[None]
+        return (jnp.asarray(x) - self.x_mean[None]) / self.x_std[None]
 
     def y_to_data(self, h: Float[Array, "L n dy"]) -> Float[Array, "L n dy"]:
         """Bring normalised function values to data units."""

@@ -78,7 +78,8 @@ class FunctionPrior(NamedTuple):
             return jnp.zeros((n, x.shape[0], self.dim_y), x.dtype)
         phi = sample_parameters(key, self.params, n, x.dtype)
         at_all_inputs = jax.vmap(self.step, in_axes=(0, None))
-        return jax.vmap(at_all_inputs, in_axes=(None, 0))(x, phi)
+        draws: Array = jax.vmap(at_all_inputs, in_axes=(None, 0))(x, phi)
+        return draws
 
     def covariance(self, x: Float[Array, "M dx"], scale: Float[Array | np.ndarray, " dy"]) -> Float[Array, "dy M M"]:
         """Covariance of the Gaussian part; the correlation matrix is shared by the outputs."""
@@ -86,7 +87,8 @@ class FunctionPrior(NamedTuple):
         if self.kernel is None:
             return jnp.broadcast_to(white[None], (self.dim_y, *white.shape))
         scaled = x * jnp.asarray(self.input_scale, x.dtype)[None]
-        return (scale**2)[:, None, None] * gram(self.kernel, scaled, scaled)[None] + white[None]
+        variance = jnp.asarray(scale) ** 2
+        return variance[:, None, None] * gram(self.kernel, scaled, scaled)[None] + white[None]
 
 
 @dataclass(frozen=True)
