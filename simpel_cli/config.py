@@ -99,6 +99,26 @@ def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:
     return cls
 
 
+def _function(name: str, path: str, plugins: tuple[str, ...]) -> Any:
+    """Import a function of a package that the user named in `run.plugins`."""
+    module_name, _, attribute = name.rpartition(".")
+    package = name.split(".")[0]
+    if package not in plugins or not module_name:
+        raise ConfigError(
+            f"{path}: got {name}; expected package.module.function of a package in run.plugins ({list(plugins)}). "
+            f"If you trust it: 'run.plugins=[{package}]'."
+        )
+    try:
+        found = getattr(importlib.import_module(module_name), attribute, None)
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: cannot import {module_name} ({error}). Install its package, or put its folder into PYTHONPATH."
+        ) from error
+    if not callable(found):
+        raise ConfigError(f"{path}: {module_name} has no function {attribute}.")
+    return found
+
+
 def _convert(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type) -> Any:
     """Convert a YAML value to a field's type, or say what was expected."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) or _origin(hint) is typing.Union else (hint,)
@@ -120,6 +140,8 @@ def _as(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type)
     origin = _origin(hint)
     if hint is Any:
         return value
+    if origin is collections.abc.Callable:
+        return _function(value, path, plugins) if isinstance(value, str) else _NO
     if hint is bool or hint is str:
         return value if isinstance(value, hint) else _NO
     if hint is int:

@@ -23,6 +23,7 @@ from simulators.parameters import draw
 from simulators.worlds.world import World
 
 NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
+WORLD_POINTS, WORLD_DRAWS = 200, 16  # of the normaliser, where a query costs a simulation and not a microsecond
 SCALE_POINTS, SCALE_DRAWS = 128, 512
 DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
 
@@ -93,8 +94,9 @@ def normaliser_of(system: System, key: PRNGKeyArray) -> Normaliser:
         ConfigError: an output of the simulator does not vary over domain and parameters.
     """
     key_x, key_phi = jax.random.split(key)
-    x = np.asarray(system.domain.sample(key_x, NORMALISER_POINTS, jnp.float64))
-    values = system.simulate(key_phi, x, NORMALISER_DRAWS).reshape(-1, system.encoding.dim_y)
+    points, draws = (NORMALISER_POINTS, NORMALISER_DRAWS) if system.transition else (WORLD_POINTS, WORLD_DRAWS)
+    x = np.asarray(system.domain.sample(key_x, points, jnp.float64))
+    values = system.simulate(key_phi, x, draws).reshape(-1, system.encoding.dim_y)
     y_mean, spread = values.mean(axis=0), values.std(axis=0)
     gap = system.encoding.per_target(system.source.gap, np.nan)
     std = np.sqrt(spread**2 + np.where(np.isnan(gap), DEFAULT_GAP_FRACTION * spread, gap) ** 2)
