@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from simpel_cli.errors import ConfigError, did_you_mean
+from simpel_cli.run import refuse_occupied
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
-RUN_ID = secrets.token_hex(3)  # two starts in one second must never share a run directory
+ROLES = {"sim": "model", "prior": "uses_simulator", "score": "closed_form_gap", "method": "bind"}
 
 
 def conf_dir() -> Path:
@@ -61,6 +62,9 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
     cls = _resolve(str(target), path, plugins) if target is not None else default
     if cls is None:
         raise ConfigError(f"{path}: the key _target_ is missing; it names the class, e.g. simulators.model.Declared.")
+    role = ROLES.get(path)
+    if role is not None and role not in {*dir(cls), *(f.name for f in dataclasses.fields(cls))}:
+        raise ConfigError(f"{path}._target_: {target} is no {path}; the options in conf/{path}/ show what is.")
     known = {f.name: f for f in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
     for key in fields:
@@ -85,6 +89,8 @@ def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:
             f"To use a package of your own, name it: 'run.plugins=[{package}]'."
         )
     module_name, _, name = target.rpartition(".")
+    if not module_name:
+        raise ConfigError(f"{path}._target_: got {target}; a class is named with its module, package.module.Class.")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
@@ -217,6 +223,10 @@ class Job(typing.NamedTuple):
     words: str = ""  # the overrides that tell this job from the others of a sweep
 
 
+class _Stopped(BaseException):
+    """Carries what a task raised past Hydra, which would print a line of its own and go on with a multirun."""
+
+
 def launch(
     verb: str, task: Callable[[Job], Any], overrides: list[str], *, config_dir: Path | None, flags: list[str]
 ) -> None:
@@ -233,38 +243,43 @@ def launch(
         ConfigError: what the user wrote does not compose.
     """
     import hydra
-    import yaml
     from hydra.core.hydra_config import HydraConfig
-    from hydra.errors import HydraException
-    from omegaconf import DictConfig, OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
+    from omegaconf import OmegaConf
 
-    register_resolvers()
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us as exceptions, not as Hydra's printout
-    words = [_force(o) for o in overrides]
+    words = checked(overrides)
     user = _user_conf(config_dir)
+    if "--cfg" not in flags:
+        _refuse_other_runs(overrides)
+    register_resolvers()
+    known = _top_level(verb)
 
-    def entry(config: DictConfig) -> Any:
-        hydra_config = HydraConfig.get()
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
-        directory = Path(hydra_config.runtime.output_dir)
-        own = " ".join(
-            w.removeprefix("++") for w in hydra_config.overrides.task if w.removeprefix("++") not in overrides
-        )
-        return task(Job(typing.cast(dict[str, Any], plain), directory, folder, own))
+    def entry(config: Any) -> Any:
+        try:
+            hydra_config = HydraConfig.get()
+            plain = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+            for key in plain:
+                if key not in known:
+                    raise ConfigError(_unknown_root(str(key), verb, known))
+            folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
+            directory = Path(hydra_config.runtime.output_dir)
+            given = [w.removeprefix("++") for w in hydra_config.overrides.task]
+            return task(Job(plain, directory, folder, " ".join(w for w in given if w not in overrides)))
+        except Exception as error:
+            raise _Stopped from error
 
-    # our own exceptions pass through; what Hydra and OmegaConf raise is translated
-    arguments = [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]
-    before, sys.argv = sys.argv, arguments
+    failure: BaseException | None = None
+    before, sys.argv = sys.argv, [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us as exceptions, not as Hydra's printout
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(entry)()
-    except yaml.YAMLError as error:
-        raise ConfigError(_yaml_message(error)) from error
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_translate(error, verb)) from error
+    except _Stopped as stopped:
+        failure = _translated(stopped.__cause__, verb, user, own=False)
+    except Exception as error:
+        failure = _translated(error, verb, user, own=True)
     finally:
         sys.argv = before
+    if failure is not None:  # raised here, so that no traceback shows our detour
+        raise failure
 
 
 def count_jobs(overrides: list[str]) -> int:
@@ -274,13 +289,36 @@ def count_jobs(overrides: list[str]) -> int:
         ConfigError: an override is not of the form key=value.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_overrides(checked(overrides))
+    return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
+
+
+def checked(overrides: list[str]) -> list[str]:
+    """Return the overrides as Hydra takes them.
+
+    Raises:
+        ConfigError: one is not of the form key=value.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    try:
-        parsed = OverridesParser.create().parse_overrides([_force(o) for o in overrides])
-        return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
-    except HydraException as error:
-        raise ConfigError(_translate(error, "sweep")) from error
+    words = [_force(o) for o in overrides]
+    for given, word in zip(overrides, words, strict=True):
+        key, sign, value = given.partition("=")
+        if not given.startswith("~") and (not sign or not key or key != key.strip() or value != value.lstrip()):
+            raise ConfigError(
+                f"{given}: not of the form key=value, without blanks around the sign, e.g. method.steps=2000 or "
+                "method=fsvgd."
+            )
+        try:
+            OverridesParser.create().parse_override(word)
+        except HydraException as error:
+            raise ConfigError(
+                f"{given}: the value cannot be read. A list is written [1,2]; text with brackets, commas or quotes "
+                f"goes into quotes of its own, twice because of the shell: '{key}=\"{value}\"'."
+            ) from error
+    return words
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -310,11 +348,13 @@ def dump(config: dict[str, Any]) -> str:
 
 
 def register_resolvers() -> None:
-    """Make `${simpel_data:}` (bundled measurements) and `${run_id:}` (a hash per process) available."""
+    """Make `${simpel_data:}` (bundled measurements) and `${run_id:}` (a new hash per launch) available."""
     from omegaconf import OmegaConf
 
+    run_id = secrets.token_hex(3)  # two starts in one second must never share a run directory
+
     OmegaConf.register_new_resolver("simpel_data", lambda: str(example_data_dir()), replace=True)
-    OmegaConf.register_new_resolver("run_id", lambda: RUN_ID, replace=True)
+    OmegaConf.register_new_resolver("run_id", lambda: run_id, replace=True)
 
 
 def _force(override: str) -> str:
@@ -331,6 +371,13 @@ def _user_conf(config_dir: Path | None) -> Path | None:
     return folder.resolve()
 
 
+def _refuse_other_runs(overrides: list[str]) -> None:
+    """Look into a run directory that the user names before Hydra writes to it."""
+    for word in overrides:
+        if found := re.fullmatch(r"\+*hydra\.run\.dir=['\"]?(.*?)['\"]?", word):
+            refuse_occupied(Path(found[1]))
+
+
 def _group_folder(group: str, choice: str | None, user: Path | None) -> Path:
     """Return the folder of the YAML that a group's choice came from."""
     for root in [user, conf_dir()]:
@@ -345,6 +392,51 @@ def _yaml_message(error: Any) -> str:
     return f"{where}not valid YAML ({getattr(error, 'problem', None) or error})."
 
 
+def _translated(error: BaseException | None, verb: str, user: Path | None, *, own: bool) -> BaseException:
+    """Return a `ConfigError` for what the user can have caused, anything else as it is.
+
+    Args:
+        error: what was raised.
+        verb: that was launched.
+        user: folder with the user's groups.
+        own: Hydra itself raised it, not the task.
+    """
+    import yaml
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    assert error is not None
+    message = None
+    if isinstance(error, OmegaConfBaseException | HydraException):
+        message = _translate(error, verb)
+    elif own and isinstance(error, yaml.YAMLError):
+        message = _yaml_message(error)
+    elif own and isinstance(error, UnicodeDecodeError):
+        message = f"{_not_text(user)}: not UTF-8 text ({error.reason}). Save it in UTF-8."
+    elif own and isinstance(error, OSError) and error.filename:
+        message = (
+            f"hydra.run.dir: cannot write to {error.filename} ({error.strerror}). Choose another: hydra.run.dir=DIR."
+        )
+    elif own and isinstance(error, ValueError) and "Config group override must be" in str(error):
+        groups = ", ".join(name for name in _top_level(verb) if name != "choices")
+        message = f"a group cannot be null: name one of its options, e.g. method=simpel (groups and keys: {groups})."
+    if message is None:
+        return error
+    translated = ConfigError(message)
+    translated.__cause__ = error
+    return translated
+
+
+def _not_text(user: Path | None) -> str:
+    """First YAML file of the user's that is not UTF-8."""
+    for path in sorted(user.rglob("*.yaml")) if user is not None else []:
+        try:
+            path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            return str(path)
+    return "a YAML file"
+
+
 def _translate(error: Exception, verb: str) -> str:
     """Say in one line what Hydra and OmegaConf say in ten."""
     text = str(error)
@@ -357,19 +449,58 @@ def _translate(error: Exception, verb: str) -> str:
     if found := re.search(r"Could not find '([^']+)'", text):
         return f"{found[1]}: no such configuration. Groups are folders with YAML files, given with --config-dir DIR."
     if found := re.search(r"Could not override '([\w.@/]+)'", text):
-        return f"{found[1]}: no such key or group of `simpel {verb}`.{did_you_mean(found[1], _top_level(verb))}"
-    if found := re.search(r"Error parsing override '(.*)'", text):
+        return _unknown_root(found[1], verb, _top_level(verb))
+    if found := re.search(r"Ambiguous value for argument '\+*([^']*)'", text):
+        key, _, value = found[1].partition("=")
         return (
-            f"{found[1]}: not of the form key=value ({text.splitlines()[-1].strip() or text.splitlines()[1].strip()})."
+            f"{found[1]}: several values, but `simpel {verb}` takes one. Run each of them with "
+            f"`simpel sweep {found[1]}`; a list is written '{key}=[{value}]'."
         )
     lines = [line.strip() for line in [*str(cause or "").splitlines(), *text.splitlines()] if line.strip()]
     key = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
-    return f"{key + ': ' if key else ''}{lines[0] if lines else text}"
+    what = lines[0] if lines else text
+    if "'sim.name' not found" in what or "Index 'name'" in what:
+        return (
+            "sim.name: missing. A simulator's YAML is a mapping with the keys _target_, name, dt, states, dynamics, ..."
+        )
+    return f"{key + ': ' if key else ''}{_interpolation(what, key)}"
+
+
+def _interpolation(text: str, key: str) -> str:
+    """Say what is wrong with a value that refers to another."""
+    if "'sim.name' not found" in text or "Index 'name'" in text:
+        return (
+            "the simulator has no key `sim.name`; its YAML is a mapping with _target_, name, dt, states, dynamics, ..."
+        )
+    if found := re.search(r"Interpolation key '(.+)' not found", text):
+        return f"${{{found[1]}}} names a key that does not exist. Write out the value, or the whole path of the key."
+    if found := re.search(r"Environment variable '(.+)' not found", text):
+        return f"the environment variable {found[1]} is not set: set it, or give a default, ${{oc.env:{found[1]},DEFAULT}}."
+    if found := re.search(r"Unsupported interpolation type (.+)", text):
+        return f"${{{found[1]}:...}} is unknown; allowed are ${{oc.env:NAME}}, ${{simpel_data:}} and ${{key}}."
+    if "Missing mandatory value" in text:
+        return f"a value must be given (the YAML says ???), e.g. on the command line: {key}=VALUE."
+    if found := re.search(r"(?:no viable alternative|mismatched|token recognition).*?'(\$\{.*)'", text):
+        return f"{found[1]!r} is no complete ${{...}}; close the brace."
+    return text
+
+
+def _unknown_root(key: str, verb: str, known: list[str]) -> str:
+    if key == "experiment":
+        return "experiment: its file must begin with the line `# @package _global_`, so that it can set every group."
+    if key.startswith("hydra."):
+        return f"{key}: no such key of Hydra's; `simpel {verb} --cfg hydra` shows them."
+    shown = [name for name in known if name != "choices"]
+    return f"{key}: no such key or group of `simpel {verb}`.{did_you_mean(key, shown)} (it has: {', '.join(shown)})"
 
 
 def _top_level(verb: str) -> list[str]:
+    """Groups and keys of a root configuration and of those that it builds on."""
     import yaml
 
     root = yaml.safe_load((conf_dir() / f"{verb}.yaml").read_text())
-    groups = [next(iter(d)).split("/")[-1] for d in root.get("defaults", []) if isinstance(d, dict)]
-    return [*(g.removeprefix("optional ") for g in groups), *(k for k in root if k != "defaults")]
+    entries = root.get("defaults", [])
+    inherited = [name for e in entries if isinstance(e, str) and e != "_self_" for name in _top_level(e)]
+    groups = [name for name in (next(iter(d)) for d in entries if isinstance(d, dict)) if "/" not in name]
+    own = [k for k in root if k not in ("defaults", "hydra")]
+    return list(dict.fromkeys([*inherited, *(g for g in groups if g != "experiment"), *own]))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.encoding import Encoding
@@ -26,7 +27,7 @@ class Domain:
         quantities = [*enc.states, *(list(enc.inputs) * (enc.stack + 1))]
         return np.array([q.low for q in quantities]), np.array([q.high for q in quantities])
 
-    def sample(self, key: PRNGKeyArray, n: int, dtype: jnp.dtype) -> Float[Array, "n dx"]:
+    def sample(self, key: PRNGKeyArray, n: int, dtype: DTypeLike) -> Float[Array, "n dx"]:
         """Draw n network inputs (data units), uniform in the box, angles encoded."""
         low, high = (jnp.asarray(b, dtype) for b in self.bounds())
         points = jax.random.uniform(key, (n, low.shape[0]), dtype) * (high - low)[None] + low[None]

@@ -6,13 +6,14 @@ Reference: Rasmussen and Williams (2006), eqs. 4.9, 4.17, 2.25-2.26.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+@runtime_checkable
 class Kernel(Protocol):
     """Correlation as a function of the scaled squared distance."""
 

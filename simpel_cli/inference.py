@@ -5,7 +5,7 @@ A posterior = a functional prior x a score estimator x an inference rule. The ru
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,7 @@ class Problem(NamedTuple):
     bank: Bank | None = None
 
 
+@runtime_checkable
 class PriorProcess(Protocol):
     """A prior over functions: draws of its simulator part, and the covariance of its Gaussian part."""
 
@@ -77,6 +78,7 @@ class PriorProcess(Protocol):
         ...
 
 
+@runtime_checkable
 class ScoreEstimator(Protocol):
     """Score of the joint log density of one output at M points; the caller vmaps over outputs."""
 
@@ -115,6 +117,7 @@ class Inference(NamedTuple):
     members: Callable[[Any, Float[Array, "L n dx"]], Float[Array, "L n dy"]]
 
 
+@runtime_checkable
 class Method(Protocol):
     """A method YAML: hyperparameters first, data last."""
 

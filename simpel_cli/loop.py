@@ -10,16 +10,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
 
 
+@runtime_checkable
 class Rule(Protocol):
     """The part of an inference rule that the driver needs; see `simpel_cli.inference.Inference`."""
 
@@ -53,12 +54,12 @@ class Program(NamedTuple):
     init: Callable[[Any, PRNGKeyArray], Any]
     advance: Callable[[Any, PRNGKeyArray, Any, Array, Array], tuple[Any, Any]]
     problems: Any
-    keys: PRNGKeyArray
+    keys: Key[Array, " seeds"]
     stretch: int
     compile_seconds: float
 
 
-def compiled(bind: Callable[[Any], Rule], problems: Any, keys: PRNGKeyArray, stretch: int) -> Program:
+def compiled(bind: Callable[[Any], Rule], problems: Any, keys: Key[Array, " seeds"], stretch: int) -> Program:
     """Compile a rule ahead of time.
 
     Args:
@@ -68,10 +69,10 @@ def compiled(bind: Callable[[Any], Rule], problems: Any, keys: PRNGKeyArray, str
         stretch: longest number of steps of one call.
     """
 
-    def init(problems: Any, keys: PRNGKeyArray) -> Any:
+    def init(problems: Any, keys: Key[Array, " seeds"]) -> Any:
         return jax.vmap(lambda problem, key: bind(problem).init(key))(problems, keys)
 
-    def advance(problems: Any, keys: PRNGKeyArray, states: Any, start: Array, length: Array) -> tuple[Any, Any]:
+    def advance(problems: Any, keys: Key[Array, " seeds"], states: Any, start: Array, length: Array) -> tuple[Any, Any]:
         def one(problem: Any, key: PRNGKeyArray, state: Any) -> tuple[Any, Any]:
             rule = bind(problem)
             key_draw, key_step = jax.random.split(key)

@@ -5,12 +5,18 @@ Nothing heavy is imported at module level, so that `simpel --help` answers at on
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from simpel_cli.errors import SimpelError
+from simpel_cli.errors import ConfigError, Interrupted, SimpelError
+
+if TYPE_CHECKING:
+    from simpel_cli.config import Job
+
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]  # Typer exports the special case only
 
 app = typer.Typer(
     add_completion=True,
@@ -27,8 +33,17 @@ ConfigDir = Annotated[
     Path | None,
     typer.Option("--config-dir", "-cd", help="Folder with groups of your own: sim/, data/, experiment/, ..."),
 ]
+
+
+def _one_of(value: str | None) -> str | None:
+    if value not in (None, "job", "hydra", "all"):
+        raise typer.BadParameter(f"got {value!r}; allowed are job, hydra and all.")
+    return value
+
+
 Cfg = Annotated[
-    str | None, typer.Option("--cfg", help="Print the composed configuration (`--cfg job`) and do nothing.")
+    str | None,
+    typer.Option("--cfg", callback=_one_of, help="Print the composed configuration (`--cfg job`) and do nothing."),
 ]
 Multirun = Annotated[bool, typer.Option("--multirun", "-m", help="Run every combination of comma-separated values.")]
 
@@ -48,14 +63,21 @@ def fit(
 
       simpel fit --config-dir my sim=rig data=rig data.n_train=50 run.seeds=5
     """
-    from simpel_cli.commands import fit as command
-
     if resume is not None:
-        if overrides:
-            raise typer.BadParameter("a resumed run takes no overrides; its configuration is in RUN_DIR/config.yaml")
-        command.resume(resume)
-        return
-    _launch("fit", command.fit, overrides, config_dir, cfg, ["-m"] if multirun else [])
+        if overrides or config_dir or cfg or multirun:
+            raise ConfigError(
+                "--resume: a resumed run takes nothing else; its configuration is in "
+                f"{resume / 'config.yaml'}. For other settings start a new run."
+            )
+        from simpel_cli.commands.fit import resume as go_on
+
+        go_on(resume)
+    elif multirun:
+        sweep(overrides, config_dir, cfg)
+    else:
+        from simpel_cli.commands.fit import fit as task
+
+        _launch("fit", task, overrides, config_dir, cfg)
 
 
 @app.command()
@@ -72,10 +94,16 @@ def evaluate(
 
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9 --config-dir my data=rig
     """
-    from simpel_cli.commands import evaluate as command
+    if "=" in str(run_dir) and not run_dir.is_dir():
+        raise ConfigError(
+            f"evaluate: the first word is the directory of a fit, got {run_dir}: simpel evaluate RUN_DIR {run_dir}"
+        )
+    from simpel_cli.commands.evaluate import evaluate as task
+    from simpel_cli.run import read_manifest
 
-    words = [f"run_dir='{run_dir}'", *(overrides or [])]
-    _launch("evaluate", command.evaluate, words, config_dir, cfg, [])
+    read_manifest(run_dir)
+    quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")
+    _launch("evaluate", task, [f"run_dir='{quoted}'", *(overrides or [])], config_dir, cfg)
 
 
 @app.command()
@@ -87,9 +115,9 @@ def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = 
 
       simpel sweep --config-dir my sim=rig data=rig data.n_train=20,80 'run.seed=range(5)'
     """
-    from simpel_cli.commands import sweep as command
+    from simpel_cli.commands.sweep import sweep as task
 
-    command.sweep(overrides or [], config_dir, cfg)
+    task(overrides or [], config_dir, cfg)
 
 
 @app.command()
@@ -101,29 +129,48 @@ def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg
 
       simpel simulate --config-dir my sim=rig simulation.episodes=20 simulation.seed=1 out=my/data/rig
     """
-    from simpel_cli.commands import simulate as command
+    from simpel_cli.commands.simulate import simulate as task
 
-    _launch("simulate", command.simulate, overrides, config_dir, cfg, [])
+    _launch("simulate", task, overrides, config_dir, cfg)
 
 
-def _launch(verb, task, overrides, config_dir, cfg, flags) -> None:  # type: ignore[no-untyped-def]
+def _launch(
+    verb: str,
+    task: Callable[["Job"], None],
+    overrides: list[str] | None,
+    config_dir: Path | None,
+    cfg: str | None,
+) -> None:
     from simpel_cli.config import launch
 
-    launch(verb, task, overrides or [], config_dir=config_dir, flags=[*flags, *(["--cfg", cfg] if cfg else [])])
+    launch(verb, task, overrides or [], config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])
 
 
 def main() -> None:
     """Entry point: run the command line and turn errors into one message and an exit code."""
     try:
-        app(standalone_mode=True)
+        # not standalone: errors come to us, so that they are one line each and an interrupt has its exit code
+        code = app(sys.argv[1:] or ["--help"], prog_name="simpel", standalone_mode=False)
+        if code == Interrupted.exit_code:  # Typer makes this of Ctrl-C
+            raise typer.Abort
+        sys.exit(code)
     except SimpelError as error:
         _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        _fail("interrupted.", 130)
+    except typer.Abort:
+        _fail("interrupted.", Interrupted.exit_code)
+    except UsageError as error:
+        message = cast(typer.BadParameter, error).format_message()
+        end = "" if message.endswith((".", "?")) else "."
+        _fail(f"{message}{end} See `{_command_path(error)} --help`.", ConfigError.exit_code)
     except BrokenPipeError:
         # the reader of our output went away (`simpel fit | head`): end quietly, as other tools do
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+
+
+def _command_path(error: Exception) -> str:
+    context = cast(typer.BadParameter, error).ctx
+    return context.command_path if context is not None else "simpel"
 
 
 def _fail(message: str, code: int) -> None:

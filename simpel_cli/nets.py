@@ -7,7 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-Layers = tuple[tuple[Float[Array, "fan_in fan_out"], Float[Array, " fan_out"]], ...]
+from simpel_cli.errors import ConfigError
+
+# sizes differ from layer to layer, hence `=_`: names for the reader, not to be held equal
+Layers = tuple[tuple[Float[Array, "fan_in=_ fan_out=_"], Float[Array, "fan_out=_"]], ...]
+Particles = tuple[tuple[Float[Array, "L fan_in=_ fan_out=_"], Float[Array, "L fan_out=_"]], ...]
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,10 @@ class MLP:
 
     hidden: tuple[int, ...] = (64, 64, 64)
     negative_slope: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not all(width >= 1 for width in self.hidden):
+            raise ConfigError(f"method.network.hidden: got {list(self.hidden)}; every width must be at least 1.")
 
     def init(self, key: PRNGKeyArray, dim_in: int, dim_out: int, dtype: jnp.dtype) -> Layers:
         """Draw the weights of one network.
@@ -51,6 +59,6 @@ class MLP:
         kernel, bias = layers[-1]
         return x @ kernel + bias[None]
 
-    def apply_all(self, particles: Layers, x: Float[Array, "n dx"]) -> Float[Array, "L n dy"]:
+    def apply_all(self, particles: Particles, x: Float[Array, "n dx"]) -> Float[Array, "L n dy"]:
         """Evaluate L networks (leaves with a leading axis L) at the same n inputs."""
         return jax.vmap(self.apply, in_axes=(0, None))(particles, x)

@@ -83,6 +83,10 @@ def _learning_curves(path: Path) -> Any:
             label = _label(output, unit) if i == 0 else None
             noise.plot(*zip(*line, strict=True), color=COLOURS[j % 7], alpha=0.9 if i == 0 else 0.4, label=label)
     loss.set(title="training", xlabel="step", ylabel="negative log-likelihood per point [nat]")
+    # the fall of the first steps is not what one looks for: scale the axis to what follows
+    late = [r["value"] for r in rows if r["metric"] == "loss" and r["step"] >= 0.05 * rows[-1]["step"]]
+    margin = 0.05 * (max(late) - min(late)) + 1e-9
+    loss.set_ylim(min(late) - margin, max(late) + margin)
     noise.set(title="learned noise", xlabel="step", ylabel="standard deviation", yscale="log")
     noise.legend(fontsize=7, frameon=False)
     return figure

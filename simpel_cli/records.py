@@ -91,6 +91,9 @@ class MetricStream:
 
     def _read(self) -> list[dict[str, Any]]:
         rows = []
+        table = self.directory / "metrics.parquet"
+        if not self.path.exists() and table.exists():  # stopped after `close`, while figures were drawn
+            return read_metrics(table)
         with contextlib.suppress(FileNotFoundError):
             for line in self.path.read_text().splitlines():
                 with contextlib.suppress(json.JSONDecodeError):  # the last line of a killed run may be half-written

@@ -25,7 +25,9 @@ pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color
 {% for table in tables %}<h2>{{ table.title }}</h2>
 {% if table.note %}<p>{{ table.note }}</p>{% endif %}
 <div class="scroll"><table><thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in table.rows %}<tr>{% for cell in row %}<td{% if table.text %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}
+{% for row in table.rows %}<tr>{% for cell in row %}<td{% if table.text %} class="text">{{ cell }}{% else %}>
+{% set parts = cell.split(" (") %}{{ parts[0] }}{% if parts[1] %}<br><span class="interval">({{ parts[1] }}</span>{% endif %}
+{% endif %}</td>{% endfor %}
 </tr>{% endfor %}</tbody></table></div>{% endfor %}
 {% for figure in figures %}<h2>{{ figure.title }}</h2><p>{{ figure.note }}</p>
 <img alt="{{ figure.title }}" src="data:image/png;base64,{{ figure.data }}">{% endfor %}

@@ -196,6 +196,21 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     return record
 
 
+def refuse_occupied(directory: Path, key: str = "hydra.run.dir") -> None:
+    """Refuse a directory that holds a run, unless that run failed before anything was computed.
+
+    Raises:
+        ConfigError: it holds one.
+    """
+    if not (directory / "manifest.json").exists():
+        return
+    record = read_manifest(directory)
+    if record.get("status") == "failed" and not (directory / "checkpoint").exists():
+        return
+    go_on = f"Go on with `simpel fit --resume {directory}`, or choose" if record["command"] == "fit" else "Choose"
+    raise ConfigError(f"{key}: {directory} holds a run already. {go_on} another directory; nothing was changed.")
+
+
 def make_directory(path: Path, key: str = "hydra.run.dir") -> Path:
     """Create a directory that the key names, and prove that it can be written.
 

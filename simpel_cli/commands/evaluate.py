@@ -2,15 +2,17 @@
 
 from pathlib import Path
 
-from simpel_cli.commands.fit import checkpointed_state
+from simpel_cli.commands.fit import checkpointed_state, refuse_changed_inputs
 from simpel_cli.commands.judge import judge
 from simpel_cli.commands.show import publish
 from simpel_cli.commands.study import open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, did_you_mean
 from simpel_cli.records import write_metrics, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest
+from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied
+
+OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit
 
 
 def evaluate(job: Job) -> None:
@@ -23,15 +25,20 @@ def evaluate(job: Job) -> None:
     if record["command"] != "fit":
         raise ConfigError(f"{run}: made by `simpel {record['command']}`; evaluate takes the directory of a fit.")
     trained = load(run / "config.yaml")
-    directory = make_directory(job.directory)
     own = resolved(job)
-    config = trained | {k: own[k] for k in ("evaluation",) if own.get(k)}
-    config["run"] = trained["run"] | {
-        k: own["run"][k] for k in ("quiet", "device", "cache") if k in (own.get("run") or {})
-    }
+    config = trained | {name: (trained.get(name) or {}) | (own.get(name) or {}) for name in ("run", "evaluation")}
+    for key in own.get("run") or {}:
+        if key not in OWN_SETTINGS:
+            raise ConfigError(
+                f"run.{key}: evaluate keeps the run's own value; it takes {', '.join(f'run.{k}' for k in OWN_SETTINGS)}."
+                + did_you_mean(key, list(OWN_SETTINGS))
+            )
+    directory = make_directory(job.directory)
+    refuse_occupied(directory)
     write_text(directory / "config.yaml", dump(config | ({"judged_on": own["data"]} if own.get("data") else {})))
     with Manifest(directory, "evaluate", settings_of(config)) as manifest:
         study = open_study(config, run)
+        refuse_changed_inputs(record, study.recording.files)
         fitted = prepare(study)
         step, state = checkpointed_state(run, fitted)
         judged_on = study

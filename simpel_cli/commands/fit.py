@@ -13,9 +13,9 @@ from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest
+from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
 LOG_EVERY = 50  # steps per row of the metric table
 
@@ -24,11 +24,7 @@ def fit(job: Job) -> None:
     """Run a new fit in its run directory."""
     settings = settings_of(job.config)
     directory = make_directory(job.directory)
-    if (directory / "manifest.json").exists():
-        raise ConfigError(
-            f"hydra.run.dir: {directory} holds a run already. Go on with `simpel fit --resume {directory}`, "
-            "or choose another directory; nothing was changed."
-        )
+    refuse_occupied(directory)
     config = resolved(job)
     write_text(directory / "config.yaml", dump(config))
     with Manifest(directory, "fit", settings) as manifest:
@@ -44,12 +40,15 @@ def resume(directory: Path) -> None:
     if record.get("status") == "done":
         Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
         return
-    with Manifest(directory, "fit", settings_of(config)) as manifest:
+    inputs = record.get("inputs_sha256") or {}
+    with Manifest(directory, "fit", settings_of(config), inputs=dict(inputs)) as manifest:
         _run(config, directory, directory, manifest, resume=True)
 
 
 def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool) -> None:
     study = open_study(config, data_folder)
+    if resume:
+        refuse_changed_inputs({"inputs_sha256": manifest.inputs}, study.recording.files)
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet, directory / "run.log")
@@ -69,6 +68,20 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     metrics.add(judged.rows)
     metrics.close()
     publish(terminal, study, judged, directory, dump(config), "fit")
+
+
+def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> None:
+    """Compare the measurements with what a run's manifest says that it was trained on.
+
+    Raises:
+        DataError: a file is another one now, so that the run cannot be repeated or gone on with.
+    """
+    known = record.get("inputs_sha256") or {}
+    for file in files:
+        if known.get(str(file), digest := sha256(file)) != digest:
+            raise DataError(
+                f"{file} has changed since the run was started (its SHA-256 differs). Restore it, or fit again."
+            )
 
 
 def _train(

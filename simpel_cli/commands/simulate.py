@@ -7,7 +7,7 @@ from simpel_cli.config import Job, build, dump
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
 from simpel_cli.records import write_table, write_text
-from simpel_cli.run import Manifest, make_directory
+from simpel_cli.run import Manifest, make_directory, refuse_occupied
 from simulators.worlds.simulate import Simulate
 
 
@@ -15,6 +15,7 @@ def simulate(job: Job) -> None:
     """Simulate and write `measurements.parquet` and `card.yaml`."""
     settings = settings_of(job.config)
     out = job.config["out"]
+    refuse_occupied(job.directory)
     directory = make_directory(Path(out) if out else job.directory, "out" if out else "hydra.run.dir")
     path = directory / "measurements.parquet"
     if path.exists():

@@ -93,7 +93,7 @@ def sweep(overrides: list[str], config_dir: Path | None, cfg: str | None) -> Non
     if not cfg:
         terminal.line(f"simpel sweep · {total} jobs", style="bold")
     try:
-        launch("sweep", jobs.run, overrides, config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])
+        launch("sweep", jobs.run, overrides, config_dir=config_dir, flags=["--cfg", cfg] if cfg else ["-m"])
     finally:
         jobs.close()
         if jobs.outcomes:

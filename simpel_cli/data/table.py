@@ -145,9 +145,9 @@ def _read_csv(path: Path) -> Table:
     except (pa.ArrowException, OSError) as error:
         raise _unreadable_csv(path, faulty) from error
     names = [str(column[0].as_py() or "").strip() for column in content.columns]
-    _refuse_repeated(path, [name for name in names if name])
     if names and all(_is_number(name) for name in names):
         raise DataError(f"{path.name} starts with numbers. Its first line must name the columns, e.g. t,phi,u.")
+    _refuse_repeated(path, [name for name in names if name])
     return Table(path, {name: column[1:] for name, column in zip(names, content.columns, strict=True) if name})
 
 

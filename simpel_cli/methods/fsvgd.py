@@ -23,14 +23,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, NoiseModel, Problem, Setting
-from simpel_cli.nets import MLP, Layers
+from simpel_cli.nets import MLP, Particles
 from simpel_cli.predictive import Predictive
 
 
 class State(NamedTuple):
     """L networks, the noise parameter, and the optimiser's state of both."""
 
-    particles: Layers
+    particles: Particles
     noise: Float[Array, " dy"]
     optimiser: optax.OptState
 
@@ -58,7 +58,9 @@ class FSVGD:
         steps: number of SVGD steps.
         particles: number of networks, L.
         network: architecture.
-        learning_rate: of AdamW.
+        learning_rate: of AdamW, at the start.
+        final_learning_rate: fraction of it that is left at the last step, along a cosine; 1 = constant. A constant rate
+            leaves the particles jittering about the posterior, which the learned noise then takes for noise.
         weight_decay: of AdamW, on network weights only.
         batch: training points per step, at most; drawn with replacement.
         fresh_points: points of the domain per step.
@@ -71,7 +73,8 @@ class FSVGD:
     steps: int = 5000
     particles: int = 20
     network: MLP = MLP()
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
+    final_learning_rate: float = 0.03
     weight_decay: float = 1e-3
     batch: int = 8
     fresh_points: int = 32
@@ -98,7 +101,8 @@ class FSVGD:
         dtype = problem.x.dtype
         n_rows, dim_x = problem.x.shape
         dim_y = problem.y.shape[1]
-        optimiser = optax.adamw(self.learning_rate, weight_decay=self.weight_decay, mask=(True, False))
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
+        optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
 
         def init(key: PRNGKeyArray) -> State:
             keys = jax.random.split(key, self.particles)

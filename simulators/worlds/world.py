@@ -1,12 +1,13 @@
 """A world: a simulator that answers queries and shows no equations, such as MuJoCo or a program of the user's."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from simulators.model import Quantity
 
 
+@runtime_checkable
 class World(Protocol):
     """Query access to one transition of `dt` seconds.
 

@@ -1,0 +1,113 @@
+"""The one-step map: sanity values of SYSTEMS.md, stacked actions, and every symbolic simulator against CasADi."""
+
+import casadi
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import SYMBOLIC, model
+
+from simpel_cli.casadi_jax import to_jax
+from simpel_cli.domain import Domain
+from simpel_cli.transition import encoding_of, transition
+from simulators.model import Model
+from simulators.parameters import draw
+
+NOMINAL = {"m": 1.0, "l": 1.0, "C_m": 1.0}
+DRAG = {"c_1": 0.5, "c_2": 0.5}
+P4 = {"m": 0.6, "l": 1.4, "C_m": 1.0, "c_1": 0.45, "c_2": 0.55}
+
+
+def vector(m: Model, values: dict[str, float]) -> jax.Array:
+    assert {q.name for q in m.params} == values.keys()
+    return jnp.array([values[q.name] for q in m.params])
+
+
+@pytest.mark.parametrize(
+    ("sim", "known", "values", "start", "u", "expected"),
+    [
+        ("pendulum", {}, NOMINAL, [0.3, 1.2], 0.5, [0.3644904543, 1.384600314]),
+        ("pendulum_published", {}, {"m": 1, "l": 1, "g": 9.81}, [0.3, 1.2], 0.5, [0.3644904543, 1.384600314]),
+        ("pendulum_high_fidelity", {}, NOMINAL | DRAG, [0.3, -3.0], 0.0, [0.1599718958, -2.622635401]),
+        ("pendulum_high_fidelity", {}, NOMINAL | DRAG, [0.3, 3.0], 0.0, [0.4468862968, 2.889769756]),
+        ("pendulum_high_fidelity", {"g": 12.0}, P4, [3.1, 4.5], -2.5, [-2.991276996, 3.271074257]),
+        ("pendulum_high_fidelity", {}, NOMINAL | DRAG, [0.0, 0.0], 0.0, [0.0, 0.0]),
+    ],
+    ids=["P1", "P1-published", "P2", "P3", "P4", "P5"],
+)
+def test_sanity_values_of_the_pendulum(
+    sim: str, known: dict[str, float], values: dict[str, float], start: list[float], u: float, expected: list[float]
+) -> None:
+    m = model(sim, **known)
+    assert (m.dt, m.substeps) == (0.05, 5)
+    encoding = encoding_of(m)
+    s = jnp.array(start)
+    x = encoding.to_x(s, jnp.array([u]))
+    y = transition(m, encoding).step(x, vector(m, values))
+    np.testing.assert_allclose(encoding.decode(x[:3] + y), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(y, encoding.encode(jnp.array(expected)) - encoding.encode(s), rtol=2e-9, atol=1e-9)
+
+
+def test_sanity_values_of_the_sinusoids() -> None:
+    m = model("sinusoids")
+    values = {"a": 2.1, "w": 1.9, "c": -0.4, "w2": 1.5}
+    both = transition(m, encoding_of(m, ("f", "f2"))).step(jnp.array([1.3]), vector(m, values))
+    np.testing.assert_allclose(both, [0.7866904662, -0.2573797458], rtol=1e-9)
+    second = transition(m, encoding_of(m, ("f2",))).step(jnp.array([1.3]), vector(m, values))
+    np.testing.assert_allclose(second, both[1:], rtol=0)
+
+
+def test_of_stacked_actions_the_last_acts() -> None:
+    m = model("pendulum")
+    phi = vector(m, NOMINAL)
+    state = jnp.array([0.3, 1.2])
+    plain = transition(m, encoding_of(m)).step(encoding_of(m).to_x(state, jnp.array([0.5])), phi)
+    encoding = encoding_of(m, stack=2)
+    step = transition(m, encoding).step
+    stacked = step(encoding.to_x(state, jnp.array([-2.0, 1.5, 0.5])), phi)
+    np.testing.assert_allclose(stacked, plain, rtol=0)
+    slope = jax.jacfwd(step)(encoding.to_x(state, jnp.array([-2.0, 1.5, 0.5])), phi)[:, 3:]
+    np.testing.assert_array_equal(slope[:, :2], 0)
+    assert abs(slope[2, 2]) > 0.01  # a volt for 0.05 s, on I = 1 kg m^2
+
+
+@pytest.mark.parametrize("sim", SYMBOLIC)
+def test_simulators_agree_with_casadi(sim: str) -> None:
+    """Right-hand sides and outputs to 1e-12, their Jacobians to 1e-9, at points of the declared ranges."""
+    m = model(sim)
+    function = m.function()
+    rng = np.random.default_rng(3)
+    groups = [np.array([[q.low, q.high] for q in g]).reshape(-1, 2) for g in (m.states, m.inputs)]
+    n = 20
+    x, u = (rng.uniform(g[:, 0], g[:, 1], (n, len(g))) for g in groups)
+    p = draw(m.params, rng, n)
+    symbols = [function.sx_in(i) for i in range(3)]
+    both = casadi.vertcat(*function(*symbols))
+    jacobian = casadi.Function("J", symbols, [casadi.jacobian(both, casadi.vertcat(*symbols))])
+    sizes = np.cumsum([len(m.states), len(m.inputs)])
+
+    def ours(z: jax.Array) -> jax.Array:
+        return jnp.concatenate(to_jax(function)(*jnp.split(z, sizes)))
+
+    points = np.column_stack([x, u, p])
+    value, forward, reverse = jax.jit(jax.vmap(lambda z: (ours(z), jax.jacfwd(ours)(z), jax.jacrev(ours)(z))))(points)
+    expected = np.stack([casadi.vertcat(*function(*row)).full().ravel() for row in zip(x, u, p, strict=True)])
+    slopes = np.stack([jacobian(*row).full() for row in zip(x, u, p, strict=True)])
+    np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(forward, slopes, rtol=1e-9, atol=1e-9 * np.abs(slopes).max())
+    np.testing.assert_allclose(reverse, slopes, rtol=1e-9, atol=1e-9 * np.abs(slopes).max())
+
+
+@pytest.mark.parametrize("sim", SYMBOLIC)
+def test_simulators_step_in_batches(sim: str) -> None:
+    """Every symbolic simulator gives finite targets over its domain, and keeps angles on the unit circle."""
+    m = model(sim)
+    encoding = encoding_of(m, tuple(q.name for q in m.outputs))
+    bound = transition(m, encoding)
+    x = Domain(encoding).sample(jax.random.key(0), 16, jnp.float64)
+    phi = jnp.asarray(draw(m.params, np.random.default_rng(0), 16))
+    y = jax.jit(jax.vmap(bound.step))(x, phi)
+    assert y.shape == (16, encoding.dim_y)
+    assert np.isfinite(y).all()
+    after = x[:, : encoding.dim_state] + y[:, : encoding.dim_state]
+    np.testing.assert_allclose(encoding.encode(encoding.decode(after)), after, atol=1e-12)
