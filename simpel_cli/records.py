@@ -76,6 +76,12 @@ class MetricStream:
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in kept))
         self._file = self.path.open("a")
 
+    def __enter__(self) -> "MetricStream":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()  # the stream stays, so that the run can go on
+
     def add(self, rows: Iterable[dict[str, Any]]) -> None:
         """Append rows: any of seed, step, split, metric, output, unit, value."""
         for row in rows:

@@ -56,17 +56,17 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     describe(terminal, study, fitted)
     start, state = _restored(directory, fitted) if resume else (0, None)
     constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}
-    metrics = MetricStream(directory, constants, resume_at=start if resume else None)
     began = time.perf_counter()
-    state = _train(study, fitted, terminal, metrics, directory, state, start)
-    manifest.facts |= {
-        "compile_seconds": round(fitted.program.compile_seconds, 3),
-        "train_seconds": round(time.perf_counter() - began, 3),
-        "n_train": len(fitted.training[0][0]),
-    }
-    judged: Judged = judge(study, posteriors(study, fitted.assembled, state), directory, study.method.steps)
-    metrics.add(judged.rows)
-    metrics.close()
+    with MetricStream(directory, constants, resume_at=start if resume else None) as metrics:
+        state = _train(study, fitted, terminal, metrics, directory, state, start)
+        manifest.facts |= {
+            "compile_seconds": round(fitted.program.compile_seconds, 3),
+            "train_seconds": round(time.perf_counter() - began, 3),
+            "n_train": len(fitted.training[0][0]),
+        }
+        judged: Judged = judge(study, posteriors(study, fitted.assembled, state), directory, study.method.steps)
+        metrics.add(judged.rows)
+        metrics.close()
     publish(terminal, study, judged, directory, dump(config), "fit")
 
 
