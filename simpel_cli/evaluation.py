@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
 from simpel_cli.data.recording import Episode, Transitions
 from simpel_cli.encoding import Encoding
@@ -80,9 +80,9 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
     columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
     nll, joint, crps, pit, r, distance, mean, std, epistemic = columns
     error = y - mean
-    quantiles = np.stack([chi2.ppf(LEVELS, 1)] * dy + [chi2.ppf(LEVELS, dy)])
+    quantiles = np.stack([chi_squared_quantile(LEVELS, 1)] * dy + [chi_squared_quantile(LEVELS, dy)])
     r_all = np.column_stack([r, distance])
-    inside = np.column_stack([np.abs(pit - 0.5) <= 0.45, distance <= chi2.ppf(0.9, dy)])
+    inside = np.column_stack([np.abs(pit - 0.5) <= 0.45, distance <= chi_squared_quantile(0.9, dy)])
     return OneStep(
         nll=np.column_stack([nll, joint]),
         squared=_with_sum(error**2),
@@ -94,6 +94,11 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
         std=std,
         epistemic_std=epistemic,
     )
+
+
+def chi_squared_quantile(level: np.ndarray | float, degrees: int) -> np.ndarray:
+    """Quantile of the chi-squared distribution."""
+    return 2 * gammaincinv(degrees / 2, level)
 
 
 def _with_sum(a: np.ndarray) -> np.ndarray:

@@ -76,7 +76,7 @@ def test_the_published_update_would_be_far_too_narrow() -> None:
 
 
 def test_asymmetric_target() -> None:
-    """Gumbel: density exp(-x - exp(-x)), mean 0.5772, variance pi^2/6, skewness 1.14; started on its wrong side, skewed the wrong way."""
+    """Gumbel: density exp(-x - exp(-x)), mean 0.5772, variance pi^2/6, skewness 1.14. Started skewed the wrong way."""
     start = -np.random.default_rng(2).exponential(1.0, (50, 1)) + 3
     assert skew(start[:, 0]) < -0.5
     h = moved(start, lambda h: jnp.exp(-h) - 1, 0.7)[:, 0]

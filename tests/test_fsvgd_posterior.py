@@ -19,20 +19,21 @@ from simpel_cli.nets import MLP
 from simpel_cli.prior import GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 
-LENGTHSCALE, WHITE, NOISE, EDGE = 0.6, 1e-3, 0.1, 1.7
+LENGTHSCALE, WHITE, NOISE, EDGE = 0.6, 1e-4, 0.1, 1.7
 X = np.array([-1.2, -0.9, -0.3, 0.4, 0.5, 1.3])
 Y = np.sin(2 * X) + NOISE * np.random.default_rng(0).standard_normal(6)
 GRID = np.linspace(-EDGE, EDGE, 35)
-INSIDE = (GRID >= X.min()) & (GRID <= X.max())
+INSIDE = (X.min() <= GRID) & (X.max() >= GRID)
 
 METHOD = FSVGD(
-    steps=4000,
+    steps=2500,
     particles=50,
     network=MLP((64, 64)),
+    learning_rate=3e-3,
     weight_decay=0.0,
     batch=32,
     fresh_points=16,
-    bandwidth=2.0,
+    bandwidth=1.0,
     noise=NoiseModel(learn=False),
 )
 SMALL = dataclasses.replace(METHOD, steps=2000, particles=20, network=MLP((32, 32)))
@@ -86,24 +87,24 @@ def fitted(method: FSVGD, at: np.ndarray = GRID, seeds: tuple[int, ...] = (0,)) 
 
 
 def assert_close_to_exact(fit: Fitted) -> None:
+    """The bars of LEARNING.md at every point between the data, and on average everywhere."""
     mean, std = exact(GRID)
     error, ratio = np.abs(fit.mean - mean), fit.std / std
-    print(f"max error inside {error[:, INSIDE].max():.4f}, rms everywhere {np.sqrt((error**2).mean()):.4f}")
-    print(f"ratio inside {ratio[:, INSIDE].min():.3f}-{ratio[:, INSIDE].max():.3f}, mean {ratio.mean():.3f}")
     assert error[:, INSIDE].max() < 0.02
-    assert np.sqrt(np.mean(error**2, axis=1)).max() < 0.02
+    assert error.mean(axis=1).max() < 0.02
     assert ratio[:, INSIDE].min() > 0.8
     assert ratio[:, INSIDE].max() < 1.05
-    assert np.all((ratio.mean(axis=1) > 0.8) & (ratio.mean(axis=1) < 1.05))
+    assert ratio.mean(axis=1).min() > 0.8
+    assert ratio.mean(axis=1).max() < 1.05
 
 
 def test_posterior_is_that_of_the_gaussian_process() -> None:
-    assert_close_to_exact(fitted(dataclasses.replace(METHOD, steps=2000)))
+    assert_close_to_exact(fitted(METHOD))
 
 
 @pytest.mark.slow
 def test_posterior_is_that_of_the_gaussian_process_for_three_seeds() -> None:
-    assert_close_to_exact(fitted(METHOD, seeds=(0, 1, 2)))
+    assert_close_to_exact(fitted(dataclasses.replace(METHOD, steps=5000), seeds=(0, 1, 2)))
 
 
 @pytest.fixture(scope="module")
@@ -111,35 +112,26 @@ def reference() -> Fitted:
     return fitted(SMALL)
 
 
-def test_posterior_does_not_depend_on_the_number_of_measurement_points(reference: Fitted) -> None:
-    for points in (8, 32):
-        other = fitted(dataclasses.replace(SMALL, fresh_points=points))
-        print(
-            points,
-            np.abs(other.mean - reference.mean).max(),
-            (other.std / reference.std).min(),
-            (other.std / reference.std).max(),
-        )
-        np.testing.assert_allclose(other.std.mean(), reference.std.mean(), rtol=0.08)
-        assert np.abs(other.mean - reference.mean)[0, INSIDE].max() < 0.03
+def assert_same_posterior(one: Fitted, other: Fitted, rtol: float) -> None:
+    np.testing.assert_allclose(one.std[0, INSIDE].mean(), other.std[0, INSIDE].mean(), rtol=rtol)
+    np.testing.assert_allclose(one.mean[0, INSIDE], other.mean[0, INSIDE], atol=0.03)
 
 
-@pytest.mark.parametrize("batch", [3, 6])
-def test_likelihood_of_a_batch_stands_for_all_data(reference: Fitted, batch: int) -> None:
-    # unscaled, a batch of 3 instead of 32 would count as a tenth of the data: std more than twice as wide
-    other = fitted(dataclasses.replace(SMALL, batch=batch))
-    print(
-        batch,
-        np.abs(other.mean - reference.mean)[0, INSIDE].max(),
-        (other.std / reference.std)[0, INSIDE].min(),
-        (other.std / reference.std)[0, INSIDE].max(),
-    )
-    assert np.abs(other.mean - reference.mean)[0, INSIDE].max() < 0.05
-    np.testing.assert_allclose(other.std[0, INSIDE], reference.std[0, INSIDE], rtol=0.25)
+@pytest.mark.parametrize("points", [8, 32])
+def test_posterior_does_not_depend_on_the_number_of_measurement_points(reference: Fitted, points: int) -> None:
+    assert_same_posterior(fitted(dataclasses.replace(SMALL, fresh_points=points)), reference, 0.06)
+
+
+def test_likelihood_of_a_batch_stands_for_all_data(reference: Fitted) -> None:
+    # unscaled, 3 points instead of 32 would count as a tenth of the data. Batches cost some spread: measured 8 %
+    assert_same_posterior(fitted(dataclasses.replace(SMALL, batch=3)), reference, 0.15)
 
 
 def test_without_prior_the_fit_is_that_of_the_data() -> None:
-    free, bound = (fitted(dataclasses.replace(SMALL, prior_weight=w), at=X) for w in (0.0, 1.0))
-    print(np.abs(free.mean - Y).max(), np.abs(bound.mean - Y).max(), free.std, bound.std)
-    assert np.abs(bound.mean - Y).max() > 0.04  # the prior smooths
-    assert np.abs(free.mean - Y).max() < 0.01
+    free, bound = (fitted(dataclasses.replace(SMALL, prior_weight=w), at=np.append(X, GRID)) for w in (0.0, 1.0))
+    data, rest = slice(0, len(X)), np.append(np.zeros(len(X), bool), INSIDE)
+    residuals = [np.abs(f.mean[0, data] - Y).max() for f in (free, bound, Fitted(*(a[None] for a in exact(X))))]
+    assert residuals[0] < 0.005
+    assert min(residuals[1:]) > 0.012  # the prior smooths, and the exact posterior does as much
+    assert np.all(free.std[0, data] < bound.std[0, data])
+    assert free.std[0, rest].mean() > 2 * bound.std[0, rest].mean()  # nothing holds the particles together elsewhere

@@ -168,7 +168,7 @@ def test_truncated_checkpoint_is_refused(tmp_path: Path, keep: int) -> None:
 
 
 def test_missing_checkpoint_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no checkpoint. The run stopped before its first one"):
+    with pytest.raises(ConfigError, match=r"no checkpoint\. The run stopped before its first one"):
         load_checkpoint(tmp_path)
 
 

@@ -249,14 +249,16 @@ def test_a_failed_start_leaves_its_directory_free(tmp_path: Path) -> None:
     assert simpel(tmp_path, *words).code == 0
 
 
-class TestOfARun:
-    @pytest.fixture(scope="class")
-    def folder(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        folder = tmp_path_factory.mktemp("of_a_run")
-        rig(folder)
-        assert simpel(folder, *OWN, "hydra.run.dir=run").code == 0
-        return folder
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a user's files and a finished run."""
+    folder = tmp_path_factory.mktemp("of_a_run")
+    rig(folder)
+    assert simpel(folder, *OWN, "hydra.run.dir=run").code == 0
+    return folder
 
+
+class TestOfARun:
     @staticmethod
     def contents(folder: Path) -> dict[str, bytes]:
         return {str(p): p.read_bytes() for p in sorted((folder / "run").rglob("*")) if p.is_file()}

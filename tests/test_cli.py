@@ -1,0 +1,345 @@
+"""The verbs from end to end, with tiny settings: files of the contract, repeatability, evaluation, sweeps, simulation."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from command_line import TINY, environment, process, rig, simpel, start
+from safetensors.numpy import load_file
+
+from simpel_cli.run import sha256
+
+FIT = ("fit", "experiment=pendulum", *TINY)
+SCHEMA = [
+    ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),
+    ("sim", pa.string()), ("data", pa.string()), ("n_train", pa.int32()), ("seed", pa.int32()), ("step", pa.int64()),
+    ("split", pa.string()), ("metric", pa.string()), ("output", pa.string()), ("unit", pa.string()),
+    ("value", pa.float64()),
+]  # fmt: skip
+
+
+def rows(path: Path, *leave_out: str, split: str | None = None) -> list[dict[str, object]]:
+    """Metric rows, without the columns that name the run."""
+    table = pq.read_table(path / "metrics.parquet").to_pylist()
+    kept = [row for row in table if split is None or row["split"] == split]
+    return [{k: v for k, v in row.items() if k not in ("run", *leave_out)} for row in kept]
+
+
+def run(cwd: Path, *words: object) -> str:
+    result = simpel(cwd, *words)
+    assert result.code == 0, result.err
+    return result.out
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the directory of a fit."""
+    folder = tmp_path_factory.mktemp("fitted")
+    run(folder, *FIT, "hydra.run.dir=fit", "evaluation.horizon=0.5")
+    return folder / "fit"
+
+
+class TestFit:
+    def test_files(self, fitted: Path) -> None:
+        names = {str(p.relative_to(fitted)) for p in fitted.rglob("*") if p.is_file()}
+        expected = {
+            "manifest.json", "config.yaml", "metrics.parquet", "predictions.parquet", "calibration.parquet",
+            "horizon.parquet", "checkpoint/state.safetensors", "run.log", "report.html", ".hydra/config.yaml",
+            ".hydra/overrides.yaml", ".hydra/hydra.yaml",
+        }  # fmt: skip
+        assert expected <= names
+        figures = {n for n in names if n.endswith(".png")}
+        assert {"learning_curves.png", "predictions.png", "calibration.png", "free_run.png"} <= figures
+        assert names == expected | figures  # and nothing temporary
+
+    def test_manifest(self, fitted: Path) -> None:
+        record = json.loads((fitted / "manifest.json").read_text())
+        assert record["status"] == "done"
+        assert record["error"] is None
+        assert record["command"] == "fit"
+        assert "experiment=pendulum" in record["command_line"]
+        assert record["seed"] == 0
+        assert record["n_train"] == 20
+        assert record["wall_seconds"] > 0
+        assert {"device", "python", "platform", "finished", "git_commit"} <= record.keys()
+        assert {"jax", "hydra-core", "casadi", "numpy", "simpel"} <= record["versions"].keys()
+        assert record["versions"]["jax"]
+        for path, digest in record["inputs_sha256"].items():
+            assert sha256(Path(path)) == digest
+        assert any(p.endswith("measurements.parquet") for p in record["inputs_sha256"])
+
+    def test_schema(self, fitted: Path) -> None:
+        schema = pq.read_schema(fitted / "metrics.parquet")
+        assert list(zip(schema.names, schema.types, strict=True)) == SCHEMA
+
+    def test_constants_and_metrics(self, fitted: Path) -> None:
+        table = pq.read_table(fitted / "metrics.parquet").to_pylist()
+        for name, value in [
+            ("run", "fit"), ("command", "fit"), ("experiment", "pendulum"), ("method", "simpel"), ("sim", "pendulum"),
+            ("data", "pendulum"), ("n_train", 20), ("seed", 0),
+        ]:  # fmt: skip
+            assert {row[name] for row in table} == {value}
+        train = [row for row in table if row["split"] == "train"]
+        assert {row["step"] for row in train} == {50, 100}
+        assert {row["metric"] for row in train} == {"loss", "mean_kernel", "noise_std"}
+        test = [row for row in table if row["split"] == "test"]
+        assert {row["step"] for row in test} == {100}
+        for metric in ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error"):
+            of = [row["output"] for row in test if row["metric"] == metric]
+            assert of == ["sin(phi)", "cos(phi)", "omega", "joint"]
+            assert {row["output"] for row in test if row["metric"] == f"{metric}_low"} == set(of)
+        assert {row["unit"] for row in test if row["metric"] == "rmse" and row["output"] == "omega"} == {"rad/s"}
+
+    def test_config_is_resolved_and_builds_again(self, fitted: Path) -> None:
+        text = (fitted / "config.yaml").read_text()
+        assert "${" not in text
+        config = yaml.safe_load(text)
+        assert config["method"]["steps"] == 100
+        assert config["choices"]["method"] == "simpel"
+        assert Path(config["data"]["path"]).is_absolute()
+
+    def test_checkpoint(self, fitted: Path) -> None:
+        arrays = load_file(fitted / "checkpoint" / "state.safetensors")
+        assert arrays
+        assert all(a.dtype == "float32" or a.dtype.kind == "i" for a in arrays.values())
+
+    def test_report_is_self_contained(self, fitted: Path) -> None:
+        page = (fitted / "report.html").read_text()
+        assert len(re.findall(r'src="data:image/png;base64,', page)) >= 4
+        assert not re.search(r"""(?:src|href)=["']?(?!data:)""", page)
+        assert not re.search(r"https?://|@import|url\(", page)
+        assert "<script" not in page
+        assert "simpel evaluate" in page
+
+    def test_same_seed_same_numbers(self, fitted: Path, tmp_path: Path) -> None:
+        run(tmp_path, *FIT, "hydra.run.dir=again", "evaluation.horizon=0.5")
+        assert rows(tmp_path / "again") == rows(fitted)
+
+    def test_another_seed_other_numbers(self, fitted: Path, tmp_path: Path) -> None:
+        run(tmp_path, *FIT, "hydra.run.dir=other", "evaluation.horizon=0.5", "run.seed=1")
+        values = [[r["value"] for r in rows(d) if r["metric"] == "nll"] for d in (fitted, tmp_path / "other")]
+        assert values[0] != values[1]
+
+    def test_seeds_at_once_are_the_seeds_one_by_one(self, fitted: Path, tmp_path: Path) -> None:
+        run(tmp_path, *FIT, "hydra.run.dir=both", "evaluation.horizon=0.5", "run.seeds=2")
+        both = rows(tmp_path / "both")
+        assert {row["seed"] for row in both} == {0, 1}
+        alone = {(r["split"], r["metric"], r["output"], r["step"]): r["value"] for r in rows(fitted)}
+        ours = {(r["split"], r["metric"], r["output"], r["step"]): r["value"] for r in both if r["seed"] == 0}
+        assert ours.keys() == alone.keys()
+        # one program trains them side by side; sums are taken in another order, so not to the last bit
+        for key in [k for k in alone if k[1] in ("loss", "rmse", "noise_std")]:
+            assert ours[key] == pytest.approx(alone[key], rel=0.05)
+        assert load_file(tmp_path / "both" / "checkpoint" / "state.safetensors")[".noise"].shape[0] == 2
+
+    def test_float64(self, tmp_path: Path) -> None:
+        run(tmp_path, *FIT, "hydra.run.dir=run", "run.precision=float64")
+        arrays = load_file(tmp_path / "run" / "checkpoint" / "state.safetensors")
+        assert all(a.dtype == "float64" or a.dtype.kind == "i" for a in arrays.values())
+
+
+class TestEvaluate:
+    def test_repeats_the_judgement_of_the_fit(self, fitted: Path) -> None:
+        run(fitted.parent, "evaluate", fitted, "hydra.run.dir=evaluated", "run.quiet=true")
+        again = fitted.parent / "evaluated"
+        assert rows(again, "command") == rows(fitted, "command", split="test")
+        assert {row["command"] for row in rows(again)} == {"evaluate"}
+        assert json.loads((again / "manifest.json").read_text())["status"] == "done"
+        assert (again / "report.html").exists()
+
+    def test_another_horizon(self, fitted: Path, tmp_path: Path) -> None:
+        run(tmp_path, "evaluate", fitted, "hydra.run.dir=e", "evaluation.horizon=0.25", "run.quiet=true")
+        horizons = {r["metric"] for r in rows(tmp_path / "e") if str(r["metric"]).startswith("free_run_rmse@")}
+        assert any("0.25" in str(h) for h in horizons)
+        assert not any("0.5" in str(h) for h in horizons)
+
+    def test_other_measurements(self, fitted: Path, tmp_path: Path) -> None:
+        run(
+            tmp_path,
+            "simulate",
+            "sim=pendulum_high_fidelity",
+            "simulation.episodes=4",
+            "simulation.steps=30",
+            "out=my/made",
+        )
+        (tmp_path / "my" / "data").mkdir()
+        (tmp_path / "my" / "data" / "other.yaml").write_text(
+            "path: ../made/measurements.parquet\ntime: t\nepisode: episode\nsplit: {column: split}\n"
+        )
+        words = ("evaluate", fitted, "--config-dir", "my", "data=other", "hydra.run.dir=e", "run.quiet=true")
+        run(tmp_path, *words)
+        found = rows(tmp_path / "e")
+        assert {row["data"] for row in found} == {"other"}
+        assert {row["split"] for row in found} == {"test"}
+        nll = [[r["value"] for r in rows(d, split="test") if r["metric"] == "nll"] for d in (fitted, tmp_path / "e")]
+        assert nll[0] != nll[1]
+        record = json.loads((tmp_path / "e" / "manifest.json").read_text())
+        assert any("made" in path for path in record["inputs_sha256"])
+
+
+class TestSimulate:
+    def test_what_it_wrote_can_be_fitted(self, tmp_path: Path) -> None:
+        words = ("simulation.episodes=4", "simulation.steps=20", "simulation.noise_std.phi=0.01", "out=made")
+        run(tmp_path, "simulate", "sim=pendulum", *words)
+        table = pq.read_table(tmp_path / "made" / "measurements.parquet")
+        assert table.column_names == ["episode", "t", "phi", "omega", "u", "split"]
+        assert table.num_rows == 80
+        card = yaml.safe_load((tmp_path / "made" / "card.yaml").read_text())
+        assert card["columns"]["omega"] == {"unit": "rad/s"}
+        assert card["truth"].keys() == {"m", "l", "C_m"}
+        run(
+            tmp_path,
+            "fit",
+            "sim=pendulum",
+            "data=pendulum",
+            "data.path=made/measurements.parquet",
+            *TINY,
+            "hydra.run.dir=f",
+        )
+        assert {row["n_train"] for row in rows(tmp_path / "f")} == {57}
+
+    def test_a_static_function(self, tmp_path: Path) -> None:
+        words = ("simulation.episodes=4", "simulation.steps=10", "simulation.noise_std.f=0.1", "out=my/made")
+        run(tmp_path, "simulate", "sim=sinusoid", *words)
+        (tmp_path / "my" / "data").mkdir()
+        (tmp_path / "my" / "data" / "points.yaml").write_text(
+            "path: ../made/measurements.parquet\nlayout: transitions\nsplit: {column: split}\n"
+        )
+        run(tmp_path, "fit", "--config-dir", "my", "sim=sinusoid", "data=points", *TINY, "hydra.run.dir=f")
+        found = rows(tmp_path / "f", split="test")
+        assert {row["output"] for row in found if row["metric"] == "nll"} == {"f", "joint"}
+        assert not [row for row in found if str(row["metric"]).startswith("free_run")]
+        assert not (tmp_path / "f" / "horizon.parquet").exists()
+
+
+class TestSweep:
+    def test_a_job_that_fails_costs_itself_only(self, tmp_path: Path) -> None:
+        words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=0,1", "hydra.sweep.dir=sweep")
+        result = process(tmp_path, "sweep", *words)
+        assert result.code == 2
+        assert "2 of 4 jobs failed, the others are collected" in result.err
+        assert "method.learning_rate: got -1.0; it must be positive" in result.err
+        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
+        assert {(row["run"], row["seed"]) for row in table} == {("0", 0), ("1", 1)}
+        assert {row["split"] for row in table} == {"test"}
+        status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(4)]
+        assert status == ["done", "done", "failed", "failed"]
+        single = simpel(tmp_path, *FIT, "run.seed=1", "hydra.run.dir=single")
+        assert single.code == 0
+        of_sweep = [r["value"] for r in table if r["run"] == "1"]
+        assert of_sweep == [r["value"] for r in rows(tmp_path / "single", split="test")]
+
+    def test_a_worker_that_is_killed_costs_one_job(self, tmp_path: Path) -> None:
+        """`fit -m` is the same as `sweep`."""
+        words = ("experiment=pendulum", *TINY, "run.seed=0,1,2", "hydra.sweep.dir=sweep")
+        with start(tmp_path, "fit", "-m", *words) as child:
+            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
+            os.kill(worker_of(child.pid), signal.SIGKILL)
+            _, err = child.communicate(timeout=240)
+        assert child.returncode == 1
+        assert "1 of 3 jobs failed" in err
+        assert "1: the worker process died (out of memory, or killed)" in err
+        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
+        assert {row["seed"] for row in table} == {0, 2}
+
+    def test_ctrl_c_stops_it_and_keeps_what_is_done(self, tmp_path: Path) -> None:
+        words = ("experiment=pendulum", *TINY, "run.seed=range(9)", "hydra.sweep.dir=sweep")
+        with start(tmp_path, "sweep", *words, start_new_session=True) as child:
+            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
+            os.killpg(child.pid, signal.SIGINT)  # as a terminal does
+            _, err = child.communicate(timeout=120)
+        assert child.returncode == 130
+        assert "stopped: the sweep was stopped; finished jobs are kept." in err
+        assert "Traceback" not in err
+        assert not (tmp_path / "sweep" / "3").exists()
+        assert 0 in {row["seed"] for row in pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()}
+
+
+def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not path.exists():
+        assert child.poll() is None, child.communicate()[1]
+        assert time.monotonic() < end, f"{path} did not appear"
+        time.sleep(0.02)
+
+
+def worker_of(parent: int) -> int:
+    """Return the process of a sweep that works (not multiprocessing's resource tracker)."""
+    children = Path(f"/proc/{parent}/task/{parent}/children")
+    if not children.exists():
+        pytest.skip("no /proc: cannot find the worker process")
+    for pid in children.read_text().split():
+        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            return int(pid)
+    raise AssertionError("no worker process")
+
+
+class TestWords:
+    @pytest.mark.parametrize("verb", ["fit", "sweep", "simulate"])
+    def test_cfg_prints_and_does_nothing(self, verb: str, tmp_path: Path) -> None:
+        result = simpel(tmp_path, verb, "--cfg", "job")
+        assert result.code == 0, result.err
+        assert "sim" in yaml.safe_load(result.out)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_cfg_of_evaluate(self, fitted: Path, tmp_path: Path) -> None:
+        result = simpel(tmp_path, "evaluate", fitted, "--cfg", "job")
+        assert result.code == 0, result.err
+        assert yaml.safe_load(result.out)["run_dir"] == str(fitted)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        "words",
+        [
+            ("--config-dir", "my", "sim=cart", "data=rig", "--cfg", "job"),
+            ("sim=cart", "--config-dir", "my", "--cfg", "job", "data=rig"),
+            ("--cfg", "job", "sim=cart", "data=rig", "--config-dir", "my/"),
+        ],
+    )
+    def test_options_may_stand_anywhere(self, words: tuple[str, ...], tmp_path: Path) -> None:
+        rig(tmp_path)
+        config = yaml.safe_load(run(tmp_path, "fit", *words))
+        assert config["sim"]["name"] == "cart"
+        assert config["data"]["columns"] == {"s": "pos", "v": "vel", "u": "volts"}
+
+    def test_a_folder_with_conf_inside(self, tmp_path: Path) -> None:
+        my = rig(tmp_path)
+        my.rename(tmp_path / "conf")
+        (tmp_path / "run").mkdir()
+        (tmp_path / "conf").rename(tmp_path / "run" / "conf")
+        config = yaml.safe_load(run(tmp_path, "fit", "--config-dir", "run", "sim=cart", "--cfg", "job"))
+        assert config["sim"]["name"] == "cart"
+
+    def test_two_starts_in_one_second_have_two_directories(self, tmp_path: Path) -> None:
+        for _ in range(3):
+            run(tmp_path, "simulate", "sim=sinusoid", "simulation.episodes=2", "simulation.steps=2")
+        assert len(list(tmp_path.glob("runs/simulate/sinusoid/*"))) == 3
+
+    @pytest.mark.parametrize("words", [(), ("--help",), ("-h",)])
+    def test_help(self, words: tuple[str, ...], tmp_path: Path) -> None:
+        result = simpel(tmp_path, *words)
+        assert result.code == 0
+        for verb in ("fit", "evaluate", "sweep", "simulate"):
+            assert verb in result.out
+
+    @pytest.mark.parametrize("verb", ["fit", "evaluate", "sweep", "simulate"])
+    def test_help_of_a_verb_has_two_examples(self, verb: str, tmp_path: Path) -> None:
+        assert len(re.findall(rf"^\s*simpel {verb} \S", run(tmp_path, verb, "--help"), re.M)) >= 2
+
+    def test_help_imports_nothing_heavy(self) -> None:
+        code = (
+            "import sys; import simpel_cli.main; "
+            "print(*{'jax', 'hydra', 'omegaconf', 'numpy', 'casadi', 'matplotlib', 'pyarrow'} & set(sys.modules))"
+        )
+        words = [sys.executable, "-c", code]
+        found = subprocess.run(words, capture_output=True, text=True, check=True, env=environment())
+        assert found.stdout.strip() == ""

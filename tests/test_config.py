@@ -1,0 +1,254 @@
+"""Configuration: every YAML of conf/ composes and builds, lists what can be set, and `build` refuses what is wrong."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import ROOT, simpel
+
+from simpel_cli.commands.study import Evaluation
+from simpel_cli.config import build, checked, conf_dir, count_jobs
+from simpel_cli.data import Measurements
+from simpel_cli.errors import ConfigError
+from simpel_cli.run import Settings
+from simulators.model import Model
+from simulators.worlds.simulate import Simulate
+from simulators.worlds.world import World
+
+CONF = ROOT / "conf"
+DEFAULTS = {"data": Measurements, "run": Settings, "evaluation": Evaluation, "simulation": Simulate}
+GROUPS = ("sim", "data", "prior", "score", "method", "evaluation", "simulation", "run")
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def compose(folder: Path, verb: str, *words: str) -> dict:
+    """Compose as `--cfg job` does, with interpolations in place."""
+    result = simpel(folder, verb, *words, "--cfg", "job")
+    assert result.code == 0, result.err
+    return yaml.safe_load(result.out)
+
+
+def test_conf_is_the_checkouts() -> None:
+    assert conf_dir() == CONF
+
+
+@pytest.mark.parametrize(("group", "option"), [(g, o) for g in GROUPS for o in options(g)])
+def test_every_option_composes_and_builds(group: str, option: str, tmp_path: Path) -> None:
+    verb = "simulate" if group == "simulation" else "fit"
+    config = compose(tmp_path, verb, *([] if group in ("run", "evaluation") else [f"{group}={option}"]))
+    if group == "run":  # its name is taken from the simulator
+        config["run"]["name"] = "x"
+    built = build(config[group], group, default=DEFAULTS.get(group))
+    if group == "sim":
+        source = built.model()
+        assert isinstance(source, Model | World)
+        assert source.name == option
+    if group == "method":  # a method chooses its prior
+        build(config["prior"], "prior")
+
+
+@pytest.mark.parametrize("experiment", options("experiment"))
+def test_every_experiment_composes_and_builds(experiment: str, tmp_path: Path) -> None:
+    path = CONF / "experiment" / f"{experiment}.yaml"
+    lines = path.read_text().splitlines()
+    assert lines[0] == "# @package _global_"
+    assert re.match(rf"# simpel \w+ experiment={experiment}\b", lines[1]), "the second line is the command"
+    verb = lines[1].split()[2]
+    config = compose(tmp_path, verb, f"experiment={experiment}")
+    assert config["run"]["name"] == experiment
+    for group in GROUPS:
+        if group in config:
+            build(config[group], group, default=DEFAULTS.get(group))
+
+
+@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda p: str(p.relative_to(CONF)))
+def test_every_yaml_says_what_it_is(path: Path) -> None:
+    assert path.read_text().startswith("# "), "the first line is a comment that says what the file is"
+
+
+# Fields that are a system's own: a YAML of a system names those that it has.
+OWN_TO_THE_SYSTEM = {"Declared", "MujocoWorld", "CallableWorld", "Measurements"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [p for g in (*GROUPS, "experiment") for p in sorted((CONF / g).glob("*.yaml")) if "_target_" in p.read_text()],
+    ids=lambda p: str(p.relative_to(CONF)),
+)
+def test_leaves_list_every_field(path: Path) -> None:
+    """What can be set stands in the YAML with its value: users read it there."""
+    from simpel_cli.config import _resolve
+
+    def check(node: Mapping, where: str) -> None:
+        if "_target_" in node:
+            cls = _resolve(node["_target_"], where, ())
+            names = {f.name for f in dataclasses.fields(cls)}
+            written = set(node) - {"_target_", "defaults"}
+            assert written <= names
+            if cls.__name__ not in OWN_TO_THE_SYSTEM:
+                assert written == names, f"{where}: {names - written} left out"
+        for key, value in node.items():
+            if isinstance(value, Mapping):
+                check(value, f"{where}.{key}")
+
+    check(yaml.safe_load(path.read_text()), path.stem)
+
+
+def test_run_and_evaluation_list_every_field() -> None:
+    for group, cls in (("run", Settings), ("evaluation", Evaluation)):
+        written = yaml.safe_load((CONF / group / "default.yaml").read_text())
+        assert set(written) == {f.name for f in dataclasses.fields(cls)}
+
+
+class TestValuesInYamlAreTheDefaults:
+    """The dataclass and the YAML that shows it do not drift apart."""
+
+    @pytest.mark.parametrize(
+        ("group", "option"),
+        [("method", "simpel"), ("prior", "simulator"), ("score", "gaussian"), ("simulation", "default")],
+    )
+    def test_default(self, group: str, option: str) -> None:
+        node = yaml.safe_load((CONF / group / f"{option}.yaml").read_text())
+        node.pop("defaults", None)
+        built = build(node, group)
+        assert built == type(built)()
+
+
+# ---------------------------------------------------------------------------------------------------------- build()
+
+
+@dataclass(frozen=True)
+class Inner:
+    """A part.
+
+    Args:
+        width: of it, m.
+    """
+
+    width: float = 1.0
+
+
+@dataclass(frozen=True)
+class Outer:
+    """A whole.
+
+    Args:
+        count: how many,
+            over two lines.
+        sizes: one per layer.
+        inner: its part.
+        label: what to call it; null = nothing.
+    """
+
+    count: int
+    sizes: tuple[int, ...] = (1, 2)
+    inner: Inner = Inner()
+    label: str | None = None
+    table: dict[str, float] = dataclasses.field(default_factory=dict)
+    flag: bool = False
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError("outer.count: negative")
+
+
+def make(**node: object) -> Outer:
+    return build(node, "outer", default=Outer)
+
+
+class TestBuild:
+    def test_nested_dataclasses_lists_and_numbers(self) -> None:
+        made = make(count=2, sizes=[3, 4], inner={"width": 2}, table={"a": 1}, label="x")
+        assert made == Outer(2, (3, 4), Inner(2.0), "x", {"a": 1.0})
+        assert isinstance(made.inner.width, float)
+        assert isinstance(made.table["a"], float)
+
+    def test_null_where_it_is_allowed(self) -> None:
+        assert make(count=1, label=None).label is None
+
+    @pytest.mark.parametrize(
+        ("node", "message"),
+        [
+            ({"cout": 1}, r"outer\.cout: no such key in Outer\. Did you mean outer\.count\?.*how many, over two lines"),
+            ({"zzz": 1}, r"outer\.zzz: no such key in Outer\. It has: count, sizes, inner, label, table, flag"),
+            ({}, r"outer\.count: missing\. \(count: int, how many, over two lines\.\)"),
+            ({"count": "a"}, r"outer\.count: got 'a'; expected an integer: how many"),
+            ({"count": True}, r"outer\.count: got True; expected an integer"),
+            ({"count": 1.0}, r"outer\.count: got 1\.0; expected an integer"),
+            ({"count": None}, r"outer\.count: got None; expected an integer"),
+            ({"count": 1, "sizes": 3}, r"outer\.sizes: got 3; expected a list of an integer: one per layer"),
+            ({"count": 1, "sizes": [1, "b"]}, r"outer\.sizes\[1\]: got 'b'; expected an integer"),
+            ({"count": 1, "inner": {"widht": 1}}, r"outer\.inner\.widht: .*Did you mean outer\.inner\.width\?"),
+            ({"count": 1, "inner": {"width": "w"}}, r"outer\.inner\.width: got 'w'; expected a number: of it, m"),
+            ({"count": 1, "inner": 3}, r"outer\.inner: got 3; expected a mapping of keys"),
+            ({"count": 1, "table": {"a": "b"}}, r"outer\.table\.a: got 'b'; expected a number"),
+            ({"count": 1, "table": [1]}, r"outer\.table: got \[1\]; expected a mapping"),
+            ({"count": 1, "label": 3}, r"outer\.label: got 3; expected text or null"),
+            ({"count": 1, "flag": "yes"}, r"outer\.flag: got 'yes'; expected true or false"),
+            ({"count": -1}, r"outer\.count: negative"),
+        ],
+    )
+    def test_messages(self, node: dict, message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            make(**node)
+
+    def test_not_a_mapping(self) -> None:
+        with pytest.raises(ConfigError, match=r"outer: got \[1\]; expected a mapping"):
+            build([1], "outer", default=Outer)
+
+    @pytest.mark.parametrize(
+        "target",
+        [
+            "os.system",
+            "builtins.eval",
+            "pandas.read_pickle",
+            "subprocess.Popen",
+            "hydra.utils.instantiate",
+            "command_line.Result",
+        ],
+    )
+    def test_fence(self, target: str) -> None:
+        with pytest.raises(ConfigError, match=r"allowed are classes of simpel_cli, simulators\. .*run\.plugins="):
+            build({"_target_": target}, "x")
+
+    @pytest.mark.parametrize(
+        "target",
+        ["simpel_cli.config.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.run.os.system"],
+    )
+    def test_fence_holds_for_what_a_module_imports(self, target: str) -> None:
+        with pytest.raises(ConfigError, match="cannot import|is not a dataclass"):
+            build({"_target_": target}, "x")
+
+    def test_plugins_open_the_fence(self) -> None:
+        made = build({"_target_": f"{__name__}.Inner", "width": 3}, "x", (__name__,))
+        assert made.width == 3.0
+
+    def test_role_of_a_group(self) -> None:
+        with pytest.raises(ConfigError, match=r"sim\._target_: simpel_cli\.gp\.Matern32 is no sim"):
+            build({"_target_": "simpel_cli.gp.Matern32"}, "sim")
+
+
+class TestOverrides:
+    def test_a_dotted_key_may_add(self) -> None:
+        assert checked(["method.steps=3", "method=fsvgd", "hydra.run.dir=x", "~a.b", "+c.d=1"]) == [
+            "++method.steps=3", "method=fsvgd", "hydra.run.dir=x", "~a.b", "+c.d=1",
+        ]  # fmt: skip
+
+    @pytest.mark.parametrize(
+        ("words", "jobs"),
+        [(["a=1"], 1), (["a=1,2,3"], 3), (["a=1,2", "b.c=x,y,z"], 6), (["run.seed=range(5)"], 5), (["a.b=[1,2]"], 1)],
+    )
+    def test_number_of_jobs(self, words: list[str], jobs: int) -> None:
+        assert count_jobs(words) == jobs
+
+    def test_expressions(self, tmp_path: Path) -> None:
+        config = compose(tmp_path, "fit", 'sim.dynamics.omega="(m*g)/I"', "sim.parameters.I=m*l**2")
+        assert config["sim"]["dynamics"]["omega"] == "(m*g)/I"
+        assert config["sim"]["parameters"]["I"] == "m*l**2"
