@@ -262,6 +262,8 @@ def launch(
                     raise ConfigError(_unknown_root(str(key), verb, known))
             folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
             directory = Path(hydra_config.runtime.output_dir)
+            if config_dir is not None and "choices" in plain:
+                plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with
             given = [w.removeprefix("++") for w in hydra_config.overrides.task]
             return task(Job(plain, directory, folder, " ".join(w for w in given if w not in overrides)))
         except Exception as error:

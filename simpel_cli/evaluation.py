@@ -98,7 +98,7 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
 
 def chi_squared_quantile(level: np.ndarray | float, degrees: int) -> np.ndarray:
     """Quantile of the chi-squared distribution."""
-    return 2 * gammaincinv(degrees / 2, level)
+    return np.asarray(2 * gammaincinv(degrees / 2, level))
 
 
 def _with_sum(a: np.ndarray) -> np.ndarray:

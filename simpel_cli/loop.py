@@ -69,9 +69,6 @@ def compiled(bind: Callable[[Any], Rule], problems: Any, keys: Key[Array, " seed
         stretch: longest number of steps of one call.
     """
 
-    def init(problems: Any, keys: Key[Array, " seeds"]) -> Any:
-        return jax.vmap(lambda problem, key: bind(problem).init(key))(problems, keys)
-
     def advance(problems: Any, keys: Key[Array, " seeds"], states: Any, start: Array, length: Array) -> tuple[Any, Any]:
         def one(problem: Any, key: PRNGKeyArray, state: Any) -> tuple[Any, Any]:
             rule = bind(problem)
@@ -92,15 +89,22 @@ def compiled(bind: Callable[[Any], Rule], problems: Any, keys: Key[Array, " seed
 
     began = time.perf_counter()
     count = jnp.int32(0)
-    shapes = jax.eval_shape(init, problems, keys)
+    shapes = state_shape(bind, problems, keys)
     # the old state's memory is given to the new one
     ready = jax.jit(advance, donate_argnums=2).lower(problems, keys, shapes, count, count).compile()
-    return Program(jax.jit(init), ready, problems, keys, stretch, time.perf_counter() - began)
+    return Program(jax.jit(_init(bind)), ready, problems, keys, stretch, time.perf_counter() - began)
 
 
-def state_shape(program: Program) -> Any:
-    """Return shapes and dtypes of the state, as a tree."""
-    return jax.eval_shape(program.init, program.problems, program.keys)
+def state_shape(bind: Callable[[Any], Rule], problems: Any, keys: Key[Array, " seeds"]) -> Any:
+    """Return shapes and dtypes of the state, as a tree, without compiling anything."""
+    return jax.eval_shape(_init(bind), problems, keys)
+
+
+def _init(bind: Callable[[Any], Rule]) -> Callable[[Any, Key[Array, " seeds"]], Any]:
+    def init(problems: Any, keys: Key[Array, " seeds"]) -> Any:
+        return jax.vmap(lambda problem, key: bind(problem).init(key))(problems, keys)
+
+    return init
 
 
 def train(program: Program, steps: int, *, state: Any = None, start: int = 0) -> Iterator[Stretch]:

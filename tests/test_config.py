@@ -223,7 +223,7 @@ class TestBuild:
         ["simpel_cli.config.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.run.os.system"],
     )
     def test_fence_holds_for_what_a_module_imports(self, target: str) -> None:
-        with pytest.raises(ConfigError, match="cannot import|is not a dataclass"):
+        with pytest.raises(ConfigError, match=r"cannot import|is not a dataclass"):
             build({"_target_": target}, "x")
 
     def test_plugins_open_the_fence(self) -> None:

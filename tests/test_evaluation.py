@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 from systems import model
 
 from simpel_cli.data.recording import Episode
@@ -17,6 +17,7 @@ from simpel_cli.evaluation import (
     Posterior,
     blocks_of,
     bootstrap,
+    chi_squared_quantile,
     free_run,
     free_run_table,
     one_step,
@@ -87,6 +88,12 @@ def test_wrong_spread_shows(data: tuple[np.ndarray, np.ndarray], claimed: float,
     for output in OUTPUTS[:DY]:  # P(|z| < 1.645 claimed)
         assert abs(bad["coverage_90", output] - coverage) < 0.03
         assert bad["rmse", output] == pytest.approx(good["rmse", output], rel=1e-6)  # a matter of the mean alone
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 7])
+def test_chi_squared_quantiles(degrees: int) -> None:
+    levels = np.array([0.05, 0.5, 0.95])
+    np.testing.assert_allclose(chi_squared_quantile(levels, degrees), chi2.ppf(levels, degrees), rtol=1e-10)
 
 
 @pytest.mark.parametrize("n", [CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 7])

@@ -17,6 +17,8 @@ RATE, DIM = 0.1, 3
 class Info(NamedTuple):
     loss: jax.Array
     position: jax.Array
+    noise: jax.Array
+    offset: jax.Array
 
 
 class Descent(NamedTuple):
@@ -31,7 +33,7 @@ def bind(target: jax.Array) -> Descent:
     def step(key: jax.Array, z: jax.Array, offset: jax.Array) -> tuple[jax.Array, Info]:
         noise = 0.01 * jax.random.normal(key, z.shape, z.dtype)
         after = z - RATE * (z - target + offset) + noise
-        return after, Info(jnp.sum((z - target) ** 2) / 2, after)
+        return after, Info(jnp.sum((z - target) ** 2) / 2, after, noise, offset)
 
     return Descent(
         lambda key: jax.random.normal(key, (DIM,), jnp.float64),
@@ -91,11 +93,11 @@ def test_resumed_is_bit_for_bit_the_uninterrupted_run(tens: loop.Program, steps:
 
 
 def test_every_step_and_stretch_has_its_own_randomness(tens: loop.Program) -> None:
-    position = np.concatenate([s.info.position for s in run(tens, 40)], axis=1)
-    # what is left after the deterministic part: noise of the step and the offset of the stretch
-    rest = position[:, 1:] - position[:, :-1] + RATE * (position[:, :-1] - TARGETS[:, None])
-    assert len(np.unique(rest.round(12))) == rest.size
-    np.testing.assert_allclose(rest.std(), 0.01, rtol=0.15)
+    stretches = run(tens, 40)
+    noise, offset = (np.concatenate([getattr(s.info, n) for s in stretches], axis=1) for n in ("noise", "offset"))
+    assert len(np.unique(noise)) == noise.size == 3 * 40 * DIM  # no step or seed shares its noise with another
+    assert len(np.unique(offset)) == 3 * 4 * DIM  # one draw per stretch and seed
+    np.testing.assert_array_equal(offset[:, 10:20], np.repeat(offset[:, 10:11], 10, axis=1))
 
 
 def test_seeds_in_one_program_are_seeds_alone(tens: loop.Program) -> None:
@@ -118,7 +120,7 @@ def breaking_at(number: int) -> Any:
     def rule(seed: jax.Array) -> Descent:
         def step(key: jax.Array, n: jax.Array, draws: Any) -> tuple[jax.Array, Info]:
             bad = (n + 1 >= number) & (seed == 1)
-            return n + 1, Info(jnp.where(bad, jnp.inf, 0.0), jnp.zeros(2))
+            return n + 1, Info(jnp.where(bad, jnp.inf, 0.0), *[jnp.zeros(2)] * 3)
 
         return Descent(lambda key: jnp.int32(0), lambda key: jnp.zeros(()), step)
 

@@ -9,16 +9,9 @@ import casadi
 import numpy as np
 import pytest
 import yaml
+from systems import SIMS, node
 
 from simulators.model import Declared, Model, ModelError, Quantity
-
-SIMS = Path(__file__).parents[1] / "conf" / "sim"
-
-
-def node(name: str) -> dict[str, Any]:
-    content = yaml.safe_load((SIMS / f"{name}.yaml").read_text())
-    assert content.pop("_target_") == "simulators.model.Declared"
-    return content
 
 
 def rates(model: Model, x: list[float], u: float, **values: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from simpel_cli import loop
 from simpel_cli.commands.judge import Judged, judge
 from simpel_cli.commands.show import describe, publish
-from simpel_cli.commands.study import Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
+from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
@@ -55,16 +55,17 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     fitted = prepare(study)
     describe(terminal, study, fitted)
     start, state = _restored(directory, fitted) if resume else (0, None)
+    program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
     constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}
     began = time.perf_counter()
     with MetricStream(directory, constants, resume_at=start if resume else None) as metrics:
-        state = _train(study, fitted, terminal, metrics, directory, state, start)
+        state = _train(study, fitted, program, terminal, metrics, directory, state, start)
         manifest.facts |= {
-            "compile_seconds": round(fitted.program.compile_seconds, 3),
+            "compile_seconds": round(program.compile_seconds, 3),
             "train_seconds": round(time.perf_counter() - began, 3),
             "n_train": len(fitted.training[0][0]),
         }
-        judged: Judged = judge(study, posteriors(study, fitted.assembled, state), directory, study.method.steps)
+        judged: Judged = judge(study, posteriors(study, fitted, state), directory, study.method.steps)
         metrics.add(judged.rows)
         metrics.close()
     publish(terminal, study, judged, directory, dump(config), "fit")
@@ -85,13 +86,20 @@ def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> No
 
 
 def _train(
-    study: Study, fitted: Fitted, terminal: Terminal, metrics: MetricStream, directory: Path, state: Any, start: int
+    study: Study,
+    fitted: Fitted,
+    program: loop.Program,
+    terminal: Terminal,
+    metrics: MetricStream,
+    directory: Path,
+    state: Any,
+    start: int,
 ) -> Any:
     encoding, steps = study.system.encoding, study.method.steps
     y_std = np.asarray(fitted.normaliser.y_std)
-    compile_note = f"compile {fitted.program.compile_seconds:.1f} s"
+    compile_note = f"compile {program.compile_seconds:.1f} s"
     with terminal.progress("fit", steps, start) as update:
-        for stretch in loop.train(fitted.program, steps, state=state, start=start):
+        for stretch in loop.train(program, steps, state=state, start=start):
             state = stretch.state
             save_checkpoint(directory / "checkpoint", _leaves(state), {"step": stretch.step, "command": "fit"})
             metrics.add(_training_rows(study, stretch, encoding, y_std))
@@ -122,7 +130,7 @@ def _leaves(tree: Any) -> dict[str, np.ndarray]:
 
 
 def _restored(directory: Path, fitted: Fitted) -> tuple[int, Any]:
-    """Read the checkpoint into the state of the compiled program."""
+    """Read the checkpoint, if there is one."""
     if not (directory / "checkpoint" / "state.safetensors").exists():
         return 0, None  # stopped before the first checkpoint: the run starts over, with the same result
     return checkpointed_state(directory, fitted)
@@ -135,7 +143,7 @@ def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any]:
         ConfigError: no checkpoint, a damaged one, or one of another configuration.
     """
     arrays, facts = load_checkpoint(directory / "checkpoint")
-    shape = loop.state_shape(fitted.program)
+    shape = loop.state_shape(fitted.bind, fitted.assembled.problems, fitted.keys)
     paths, structure = jax.tree_util.tree_flatten_with_path(shape)
     leaves = []
     for path, expected in paths:

@@ -76,7 +76,7 @@ def publish(
         terminal.line(_aligned(free["head"], free["rows"]))
     spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
-    next_commands = _next(study, directory, command, source)
+    next_commands = _next(study, directory, source)
     figures = draw_run(directory)
     tables = [table | {"title": "One step ahead, held-out episodes"}]
     if free is not None:
@@ -157,12 +157,18 @@ def _aligned(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     )
 
 
-def _next(study: Study, directory: Path, command: str, source: Path | None) -> list[str]:
-    run = source or directory
-    name = study.settings.name
-    lines = [f"simpel evaluate {run} data=NAME          # judge it on other measurements"]
-    if command == "fit":
-        lines.append(f"simpel sweep experiment={name} method=simpel,fsvgd data.n_train=10,20,40 'run.seed=range(3)'")
-    else:
-        lines.append(f"simpel fit --resume {run}          # if it was interrupted")
-    return lines
+def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
+    """Return commands to go on with, as they can be typed where this one was."""
+    chosen = study.choices
+    own = f" --config-dir {chosen['config_dir']}" if chosen.get("config_dir") else ""
+    what = (
+        f"experiment={chosen['experiment']}"
+        if chosen.get("experiment")
+        else f"sim={chosen['sim']} data={chosen['data']}"
+    )
+    used = study.measurements.n_train
+    sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
+    return [
+        f"simpel evaluate {source or directory}{own} data={chosen['data']}          # or other measurements",
+        f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
+    ]

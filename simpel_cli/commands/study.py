@@ -1,5 +1,6 @@
 """From a resolved configuration to everything that fitting or judging a posterior needs."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,8 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Key
 
-from simpel_cli import loop
 from simpel_cli.config import Job, build
 from simpel_cli.data import Measurements, Recording, read, select, transitions
 from simpel_cli.errors import ConfigError, did_you_mean
@@ -119,16 +120,17 @@ def resolved(job: Job) -> dict[str, Any]:
 
 
 class Fitted(NamedTuple):
-    """A compiled rule on the training transitions of every seed."""
+    """A rule bound to the training transitions of every seed."""
 
     assembled: Assembled
-    program: loop.Program
+    bind: Callable[[Problem], Inference]
+    keys: Key[Array, " seeds"]
     training: list[tuple[np.ndarray, np.ndarray]]
     normaliser: Normaliser
 
 
 def prepare(study: Study) -> Fitted:
-    """Choose the training transitions of every seed, assemble the problems and compile the rule."""
+    """Choose the training transitions of every seed and assemble the problems."""
     settings, measurements = study.settings, study.measurements
     pairs = transitions(study.recording.train, measurements.stack_actions)
     training = [
@@ -152,20 +154,19 @@ def prepare(study: Study) -> Fitted:
         precision=settings.precision,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
-    rule = _bound(study.method, assembled.setting)
-    return Fitted(assembled, loop.compiled(rule, assembled.problems, keys, STRETCH), training, normaliser)
+    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, normaliser)
 
 
-def _bound(method: Method, setting: Setting) -> Any:
+def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:
     def bind(problem: Problem) -> Inference:
         return method.bind(setting, problem)
 
     return bind
 
 
-def posteriors(study: Study, assembled: Assembled, state: Any) -> list[Posterior]:
+def posteriors(study: Study, fitted: Fitted, state: Any) -> list[Posterior]:
     """Return the posterior of every seed as functions of arrays in data units."""
-    bind = _bound(study.method, assembled.setting)
+    bind, assembled = fitted.bind, fitted.assembled
     predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
     members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
     dtype = assembled.problems.x.dtype
