@@ -1,0 +1,128 @@
+"""Normaliser, gap scale by each rule, and the bank of a world that only answers queries."""
+
+import jax
+import numpy as np
+import pytest
+
+from simpel_cli.errors import ConfigError, SimpelError
+from simpel_cli.inference import padded_length
+from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.problem import WORLD_POINTS, assemble, normaliser_of, system_of
+from simpel_cli.scores.gaussian import Gaussian
+from simulators.model import Declared, ModelError
+from simulators.worlds.callable_world import CallableWorld
+
+KEY = jax.random.key(0)
+VARIABLES = {
+    "states": {"x": {"unit": "m", "range": [-1.0, 1.0]}},
+    "inputs": {"u": {"unit": "N", "range": [-2.0, 2.0]}},
+    "parameters": {"a": {"unit": "1/s", "range": [0.5, 1.5]}},
+}
+DT = 0.1
+
+
+def exact(states, inputs, params):
+    """One transition of dx/dt = -a x + u, by its solution."""
+    decay = np.exp(-params * DT)
+    return states * decay + inputs * (1 - decay) / params
+
+
+def declared(gap=None):
+    return Declared("decay", DT, **VARIABLES, dynamics={"x": "-a*x + u"}, gap=gap or {}).model()
+
+
+def world(function=exact, batched=True):
+    return CallableWorld("decay", DT, function, batched, **VARIABLES).model()
+
+
+def assembled(system, prior, n=6, seeds=1):
+    rng = np.random.default_rng(1)
+    states, inputs = rng.uniform(-1, 1, (n, 1)), rng.uniform(-2, 2, (n, 1))
+    x = system.encoding.to_x(states, inputs)
+    y = exact(states, inputs, np.ones((n, 1))) - states + 0.3 * states**2
+    normaliser = normaliser_of(system, KEY)
+    return normaliser, assemble(
+        system, normaliser, prior, Gaussian(), [(x, y)] * seeds, {"x": 0.001},
+        least_noise=0.1, pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32",
+    )  # fmt: skip
+
+
+def test_normaliser_is_that_of_the_exact_solution():
+    gap = 0.2
+    normaliser = normaliser_of(system_of(declared({"x": gap}), (), 0), KEY)
+    rng = np.random.default_rng(0)
+    x, u, a = rng.uniform(-1, 1, (400_000, 1)), rng.uniform(-2, 2, (400_000, 1)), rng.uniform(0.5, 1.5, (400_000, 1))
+    spread = (exact(x, u, a) - x).std()
+    np.testing.assert_allclose(normaliser.y_std, np.hypot(spread, gap), rtol=0.03)
+    np.testing.assert_allclose(normaliser.x_std, [2 / np.sqrt(12), 4 / np.sqrt(12)])
+
+
+def test_an_output_that_never_changes_is_refused():
+    still = Declared("still", DT, states={"x": {"range": [-1.0, 1.0]}}, dynamics={"x": "0"}).model()
+    with pytest.raises(ConfigError, match="`x` in one transition has standard deviation 0"):
+        normaliser_of(system_of(still, (), 0), KEY)
+
+
+def test_gap_scale_by_each_rule():
+    system = system_of(declared({"x": 0.2}), (), 0)
+    normaliser, stated = assembled(system, SimulatorPrior(GapGP(scale="declared")))
+    np.testing.assert_allclose(stated.gap_scale, [0.2])
+    np.testing.assert_allclose(stated.problems.gap_scale[0], 0.2 / normaliser.y_std, rtol=1e-6)
+    assert assembled(system, SimulatorPrior(GapGP(scale=0.5)))[1].gap_scale == pytest.approx(0.5 * normaliser.y_std)
+    assert assembled(system, SimulatorPrior(gap=None))[1].gap_scale is None
+    chosen = assembled(system, SimulatorPrior(GapGP(scale="auto")), n=60)[1].gap_scale
+    # the data have 0.3 x^2, whose root mean square on the domain is 0.3/sqrt(5) = 0.13, beside the simulator
+    assert 0.03 < chosen[0] < 1.0
+    bare = assembled(system_of(declared(), (), 0), SimulatorPrior(GapGP(scale="declared")), n=60)[1].gap_scale
+    np.testing.assert_allclose(bare, chosen, rtol=0.3)  # what is not declared is chosen
+
+
+def test_padding_repeats_rows_and_counts_the_real_ones():
+    problems = assembled(system_of(declared(), (), 0), SimulatorPrior(), seeds=2)[1].problems
+    assert problems.x.shape == (2, padded_length(6), 2)
+    assert problems.m.tolist() == [6, 6]
+    assert (np.asarray(problems.x[0, 6:]) == np.asarray(problems.x[0, 5])).all()
+
+
+def test_bank_of_a_world_holds_the_training_inputs_first_and_one_function_per_draw():
+    prior = SimulatorPrior(draws=12)
+    bank = assembled(system_of(world(), (), 0), prior)[1].problems.bank
+    problems = assembled(system_of(world(), (), 0), prior)[1].problems
+    np.testing.assert_allclose(bank.x[0, : problems.x.shape[1]], problems.x[0], rtol=1e-6)
+    x, u = np.asarray(bank.x[0, :, 0], float), np.asarray(bank.x[0, :, 1], float)
+    change = np.asarray(bank.samples[0, :, 0, :], float)  # (points, draws)
+    # each draw is one parameter: recover it at one point, predict the others
+    at = int(np.argmax(np.abs(x)))
+    grid = np.linspace(0.5, 1.5, 20001)
+    for draw in range(12):
+        guesses = exact(x[at], u[at], grid) - x[at]
+        a = grid[np.argmin(np.abs(guesses - change[at, draw]))]
+        np.testing.assert_allclose(change[:, draw], exact(x, u, a) - x, atol=2e-4)
+
+
+def test_a_world_gives_the_normaliser_of_its_equations():
+    of_equations = normaliser_of(system_of(declared(), (), 0), KEY)
+    of_world = normaliser_of(system_of(world(), (), 0), KEY)
+    np.testing.assert_allclose(of_world.y_std, of_equations.y_std, rtol=3 / np.sqrt(WORLD_POINTS))
+
+
+def test_a_gp_prior_queries_nobody():
+    def never(states, inputs, params):
+        if len(states) > 16 * WORLD_POINTS:
+            raise AssertionError("queried beyond the normaliser")
+        return exact(states, inputs, params)
+
+    assert assembled(system_of(world(never), (), 0), GPPrior())[1].problems.bank is None
+
+
+def test_one_query_at_a_time_gives_the_same():
+    single = world(lambda s, u, a: exact(s, u, a), batched=False)
+    queries = np.array([[0.3], [-0.2]]), np.array([[1.0], [0.5]]), np.array([[0.7], [1.2]])
+    np.testing.assert_allclose(single.step(*queries), world().step(*queries))
+
+
+def test_wrong_answers_of_a_world_are_named():
+    with pytest.raises(ModelError, match="Is `batched` right"):
+        world(lambda s, u, a: s[0]).step(np.zeros((3, 1)), np.zeros((3, 1)), np.ones((3, 1)))
+    with pytest.raises(SimpelError, match="returned \\[nan\\]"):
+        normaliser_of(system_of(world(lambda s, u, a: s * np.nan), (), 0), KEY)
