@@ -91,3 +91,19 @@ def test_correlated_gaussian() -> None:
     h = moved(np.random.default_rng(3).normal(size=(50, 2)), lambda h: -(h - mean[None]) @ precision, 1.0)
     np.testing.assert_allclose(h.mean(axis=0), mean, atol=0.03)
     np.testing.assert_allclose(np.cov(h.T, bias=True), covariance, rtol=0.15)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
+def test_median_bandwidth_puts_half_at_the_median_distance_on_every_scale(scale):
+    h = scale * jnp.array([[0.3, -1.0], [2.0, 0.5]])
+    velocity, kernel = stein_velocity(h, jnp.zeros_like(h), "median")
+    assert kernel == pytest.approx(0.5)
+    # with K = 1/2 and s^2 = |h_1 - h_2|^2 / (2 log 2), particle 1 is pushed along h_1 - h_2
+    difference = h[0] - h[1]
+    expected = 0.5 * difference / (jnp.sum(difference**2) / (2 * np.log(2))) / 2
+    np.testing.assert_allclose(velocity[0], expected, rtol=1e-6)
+
+
+def test_median_bandwidth_of_one_particle_follows_its_score():
+    velocity, _ = stein_velocity(jnp.array([[0.3, -1.0]]), jnp.array([[1.0, 2.0]]), "median")
+    np.testing.assert_allclose(velocity, [[1.0, 2.0]])

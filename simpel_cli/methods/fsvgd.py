@@ -14,6 +14,7 @@ Liu and Wang (2016), Stein variational gradient descent, eq. 8; Treven et al., S
 """
 
 from dataclasses import dataclass
+from math import log
 from typing import NamedTuple
 
 import jax
@@ -65,7 +66,9 @@ class FSVGD:
         batch: training points per step, at most; drawn with replacement.
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
-        bandwidth: s of the kernel on function values.
+        bandwidth: s of the kernel on all function values of a step; or `median`: K = 1/2 at the median distance between
+            particles of each step, whatever the scale of the posterior. A width far above that distance leaves the
+            particles moving in step, and the posterior of clean data far too wide.
         prior_weight: exponent of the prior; 1 is Bayes.
         noise: observation noise.
     """
@@ -79,7 +82,7 @@ class FSVGD:
     batch: int = 8
     fresh_points: int = 32
     pool: int = 256
-    bandwidth: float = 2.0
+    bandwidth: float | str = 2.0
     prior_weight: float = 1.0
     noise: NoiseModel = NoiseModel()
 
@@ -91,9 +94,12 @@ class FSVGD:
             raise ConfigError(
                 f"method.pool: got {self.pool}; it must be a power of two and at least fresh_points ({self.fresh_points})."
             )
+        if isinstance(self.bandwidth, str) and self.bandwidth != "median":
+            raise ConfigError(f"method.bandwidth: got {self.bandwidth!r}; allowed are a positive number and median.")
         for name in ("learning_rate", "bandwidth"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be positive.")
+            value = getattr(self, name)
+            if not isinstance(value, str) and not value > 0:
+                raise ConfigError(f"method.{name}: got {value}; it must be positive.")
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
@@ -186,7 +192,7 @@ def _log_likelihood(h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Fl
 
 
 def stein_velocity(
-    h: Float[Array, "L *d"], score: Float[Array, "L *d"], bandwidth: float
+    h: Float[Array, "L *d"], score: Float[Array, "L *d"], bandwidth: float | str
 ) -> tuple[Float[Array, "L *d"], Float[Array, ""]]:
     """Return phi_i = 1/L sum_l [K_li s_l + grad_{h_l} K_li] and the mean off-diagonal K.
 
@@ -196,9 +202,14 @@ def stein_velocity(
     """
     n = h.shape[0]
     flat, drive = h.reshape(n, -1), score.reshape(n, -1)
-    difference = flat[:, None, :] - flat[None, :, :]
-    kernel = jnp.exp(-0.5 * jnp.sum(difference**2, axis=-1) / bandwidth**2)
+    squared = jnp.sum((flat[:, None, :] - flat[None, :, :]) ** 2, axis=-1)
+    if isinstance(bandwidth, str):
+        typical = jnp.median(squared[jnp.triu_indices(n, 1)]) if n > 1 else jnp.ones((), h.dtype)
+        width_squared = jnp.maximum(typical, jnp.finfo(h.dtype).tiny) / (2 * log(2))
+    else:
+        width_squared = jnp.asarray(bandwidth**2, h.dtype)
+    kernel = jnp.exp(-0.5 * squared / width_squared)
     # sum_l grad_{h_l} K_li = sum_l K_li (h_i - h_l) / s^2
-    repulsion = (jnp.sum(kernel, axis=0)[:, None] * flat - kernel.T @ flat) / bandwidth**2
+    repulsion = (jnp.sum(kernel, axis=0)[:, None] * flat - kernel.T @ flat) / width_squared
     off_diagonal = (jnp.sum(kernel) - n) / max(n * (n - 1), 1)
     return ((kernel.T @ drive + repulsion) / n).reshape(h.shape), off_diagonal
