@@ -48,7 +48,7 @@ class Problem(NamedTuple):
     """Everything a compiled program reads, as one argument of fixed shape (so that runs share programs).
 
     Training arrays are padded to a common length; only the first `m` rows count. Inputs `x` are in data units,
-    targets `y`, `gap_scale` and `noise_init` in normalised output units.
+    targets `y`, `gap_scale`, `noise_init` and `noise_floor` in normalised output units.
     """
 
     x: Float[Numbers, "m_padded dx"]
@@ -57,6 +57,7 @@ class Problem(NamedTuple):
     normaliser: Normaliser
     gap_scale: Float[Numbers, " dy"]
     noise_init: Float[Numbers, " dy"]
+    noise_floor: Float[Numbers, " dy"]
     bank: Bank | None = None
 
 
@@ -160,6 +161,9 @@ class NoiseModel:
     Args:
         learn: learn it, or keep the initial value.
         floor: smallest standard deviation when learned.
+        measured_share: nor does it fall below this share of the measurement noise that the data declare or show. A
+            network that goes through every one of a few points would else learn that there is no noise. 0.7 is the
+            sine's or cosine's share of an angle's noise.
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.
         rate: its learning rate as a multiple of the networks'. One number per output has far less to learn than a
@@ -168,23 +172,31 @@ class NoiseModel:
 
     learn: bool = True
     floor: float = 1e-3
+    measured_share: float = 0.7
     prior_std: float = 1.0
     least_init: float = 0.1
     rate: float = 10.0
 
-    def init(self, sigma: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
+    def start(self, measured: Float[Numbers, " dy"]) -> tuple[Float[Numbers, " dy"], Float[Numbers, " dy"]]:
+        """Return initial value and floor of sigma for a measurement noise (0 where unknown)."""
+        init = np.maximum(measured, self.least_init)
+        return init, np.clip(self.measured_share * np.asarray(measured), self.floor, 0.99 * init)
+
+    def init(self, sigma: Float[Numbers, " dy"], floor: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return rho for a standard deviation."""
         # inverse softplus, written so that it does not overflow for large arguments
-        above = jnp.maximum(sigma - self.floor, 1e-6)
+        above = jnp.maximum(sigma - floor, 1e-6)
         return above + jnp.log(-jnp.expm1(-above))
 
-    def std(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+    def std(self, rho: Float[Array, " dy"], floor: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return sigma."""
-        return self.floor + jax.nn.softplus(rho)
+        return jnp.asarray(floor) + jax.nn.softplus(rho)
 
-    def log_prior(self, rho: Float[Array, " dy"], sigma_init: Float[Numbers, " dy"]) -> Float[Array, ""]:
+    def log_prior(
+        self, rho: Float[Array, " dy"], sigma_init: Float[Numbers, " dy"], floor: Float[Numbers, " dy"]
+    ) -> Float[Array, ""]:
         """Log density of log sigma, up to a constant."""
-        z = (jnp.log(self.std(rho)) - jnp.log(sigma_init)) / self.prior_std
+        z = (jnp.log(self.std(rho, floor)) - jnp.log(sigma_init)) / self.prior_std
         return -0.5 * jnp.sum(z * z)
 
 

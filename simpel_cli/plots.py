@@ -183,6 +183,10 @@ def draw_sweep(path: Path, metric: str, output: str = "joint") -> Path | None:
         ticks = sorted({r["n_train"] for r in own})
         axis.set(title=panel[0], xlabel="training transitions", ylabel=f"test {metric.upper()}", xscale="log")
         axis.set_xticks(ticks, [str(t) for t in ticks])
+        values = [r["value"] for r in own]
+        if max(values) > 10 + 3 * max(np.median(values), 1.0):
+            # a few overconfident runs would flatten all others into one line
+            axis.set_yscale("symlog", linthresh=10)
         axis.minorticks_off()
         axis.legend(fontsize=8, frameon=False)
     return _save(figure, path.with_name(f"{metric}_vs_n_train.png"))

@@ -15,7 +15,7 @@ from simpel_cli.domain import Domain
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.gap import marginal_likelihood_scale
-from simpel_cli.inference import Bank, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
 from simpel_cli.transition import Transition, encoding_of, transition
 from simulators.model import Model
@@ -126,7 +126,7 @@ def assemble(
     training: list[tuple[np.ndarray, np.ndarray]],
     noise_std: dict[str, float],
     *,
-    least_noise: float,
+    noise: NoiseModel,
     pool: int,
     keys: list[PRNGKeyArray],
     precision: str,
@@ -140,7 +140,7 @@ def assemble(
         score: score estimator.
         training: inputs (m, dx) and targets (m, dy) in data units, one pair per seed, all of one length.
         noise_std: measurement noise per state and output, in its unit.
-        least_noise: least initial noise, in normalised outputs.
+        noise: of the likelihood.
         pool: number of domain points of a bank (for worlds).
         keys: one per seed, for draws of the prior that are made here.
         precision: dtype name of the networks.
@@ -149,7 +149,7 @@ def assemble(
     encoding = system.encoding
     bound = prior.bind(system.transition, *system.dims, np.asarray(normaliser.x_std))
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
-    noise_init = np.maximum(sigma, least_noise)
+    noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma))
     problems, scales = [], []
     for (x, y), key in zip(training, keys, strict=True):
         length = padded_length(len(x))
@@ -163,6 +163,7 @@ def assemble(
             normaliser=normaliser,
             gap_scale=scale,
             noise_init=noise_init,
+            noise_floor=noise_floor,
             bank=_bank(prior, system, pad_rows(x, length), pool, key_bank),
         )
         problems.append(arrays)

@@ -65,6 +65,7 @@ def fitted(method: FSVGD, at: np.ndarray = GRID, seeds: tuple[int, ...] = (0,)) 
         normaliser=Normaliser(zero, one, zero, one),
         gap_scale=one,
         noise_init=NOISE * one,
+        noise_floor=0.01 * NOISE * one,
     )
 
     def stack(a: np.ndarray) -> jax.Array:

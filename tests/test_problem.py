@@ -1,11 +1,12 @@
 """Normaliser, gap scale by each rule, and the bank of a world that only answers queries."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from simpel_cli.errors import ConfigError, SimpelError
-from simpel_cli.inference import padded_length
+from simpel_cli.inference import NoiseModel, padded_length
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.problem import WORLD_POINTS, assemble, normaliser_of, system_of
 from simpel_cli.scores.gaussian import Gaussian
@@ -43,7 +44,7 @@ def assembled(system, prior, n=6, seeds=1):
     normaliser = normaliser_of(system, KEY)
     return normaliser, assemble(
         system, normaliser, prior, Gaussian(), [(x, y)] * seeds, {"x": 0.001},
-        least_noise=0.1, pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32",
+        noise=NoiseModel(), pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32",
     )  # fmt: skip
 
 
@@ -126,3 +127,14 @@ def test_wrong_answers_of_a_world_are_named():
         world(lambda s, u, a: s[0]).step(np.zeros((3, 1)), np.zeros((3, 1)), np.ones((3, 1)))
     with pytest.raises(SimpelError, match="returned \\[nan\\]"):
         normaliser_of(system_of(world(lambda s, u, a: s * np.nan), (), 0), KEY)
+
+
+def test_learned_noise_starts_at_and_stays_above_what_was_measured():
+    noise = NoiseModel(floor=1e-3, measured_share=0.7, least_init=0.1)
+    init, floor = noise.start(np.array([0.0, 0.02, 0.5]))
+    np.testing.assert_allclose(init, [0.1, 0.1, 0.5])
+    np.testing.assert_allclose(floor, [1e-3, 0.014, 0.35])
+    rho = noise.init(jnp.asarray(init), jnp.asarray(floor))
+    np.testing.assert_allclose(noise.std(rho, jnp.asarray(floor)), init, rtol=1e-9)
+    np.testing.assert_allclose(noise.std(jnp.full(3, -50.0), jnp.asarray(floor)), floor)
+    assert NoiseModel(measured_share=1.0).start(np.array([0.3]))[1][0] < 0.3  # room for the initial value above it

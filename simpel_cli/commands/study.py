@@ -148,7 +148,7 @@ def prepare(study: Study) -> Fitted:
         study.score,
         training,
         study.recording.noise_std,
-        least_noise=study.method.noise.least_init,
+        noise=study.method.noise,
         pool=study.method.pool,
         keys=[stream(seed, "prior") for seed in settings.all_seeds],
         precision=settings.precision,

@@ -110,10 +110,13 @@ class FSVGD:
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
         optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
 
+        def noise_std(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+            return self.noise.std(rho, problem.noise_floor)
+
         def init(key: PRNGKeyArray) -> State:
             keys = jax.random.split(key, self.particles)
             particles = jax.vmap(lambda k: self.network.init(k, dim_x, dim_y, dtype))(keys)
-            noise = self.noise.init(problem.noise_init)
+            noise = self.noise.init(problem.noise_init, problem.noise_floor)
             return State(particles, noise, optimiser.init((particles, noise)))
 
         def draw(key: PRNGKeyArray) -> Draws:
@@ -146,7 +149,7 @@ class FSVGD:
 
             weight = problem.m.astype(dtype) / b
             log_likelihood, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: _log_likelihood(h, self.noise.std(rho), y), argnums=(0, 1)
+                lambda h, rho: _log_likelihood(h, noise_std(rho), y), argnums=(0, 1)
             )(h[:, :b], state.noise)
             score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
             score = score.at[:, :b].add(weight * score_data)
@@ -154,14 +157,14 @@ class FSVGD:
 
             (ascent,) = pull_back(velocity)
             # the noise is shared by the particles: its gradient is averaged over them
-            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init)
+            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init, problem.noise_floor)
             ascent_noise = weight * score_noise / self.particles + noise_prior if self.noise.learn else 0 * state.noise
             descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
             with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
                 updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
             particles = optax.apply_updates(state.particles, updates[0])
             noise = state.noise + self.noise.rate * updates[1]
-            info = Info(-log_likelihood / (b * self.particles), self.noise.std(state.noise), mean_kernel)
+            info = Info(-log_likelihood / (b * self.particles), noise_std(state.noise), mean_kernel)
             return State(particles, noise, opt_state), info
 
         def prior_score(
@@ -177,7 +180,7 @@ class FSVGD:
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             h = self.network.apply_all(state.particles, to_normalised.x(x))
-            return Predictive(to_normalised.y_to_data(h), self.noise.std(state.noise) * to_normalised.y_std)
+            return Predictive(to_normalised.y_to_data(h), noise_std(state.noise) * to_normalised.y_std)
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
             return to_normalised.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(to_normalised.x)(x)))
