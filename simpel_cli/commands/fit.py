@@ -101,8 +101,9 @@ def _train(
     with terminal.progress("fit", steps, start) as update:
         for stretch in loop.train(program, steps, state=state, start=start):
             state = stretch.state
-            save_checkpoint(directory / "checkpoint", _leaves(state), {"step": stretch.step, "command": "fit"})
+            # rows first: a kill in between leaves rows beyond the checkpoint, which resume cuts off and makes again
             metrics.add(_training_rows(study, stretch, encoding, y_std))
+            save_checkpoint(directory / "checkpoint", _leaves(state), {"step": stretch.step, "command": "fit"})
             loss = float(stretch.info.loss[:, -LOG_EVERY:].mean())
             noise = " ".join(f"{v:.2g}" for v in stretch.info.noise_std[:, -1].mean(axis=0) * y_std)
             update(stretch.step, f"loss {loss:.3g}  noise {noise}  {compile_note}")
