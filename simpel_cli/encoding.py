@@ -6,6 +6,7 @@
 Everything here is numpy-like and works on numpy and on JAX arrays, single points or batches (last axis = features).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +61,7 @@ class Encoding:
     def _state_labels(self) -> list[str]:
         return [n for q in self.states for n in ([f"sin({q.name})", f"cos({q.name})"] if q.periodic else [q.name])]
 
-    def per_target(self, values: dict[str, float], default: float) -> np.ndarray:
+    def per_target(self, values: Mapping[str, float], default: float) -> np.ndarray:
         """Spread a value per state or output (in its unit) over the target coordinates, shape (dy,)."""
         spread = [values.get(q.name, default) for q in self.states for _ in range(2 if q.periodic else 1)]
         return np.array([*spread, *(values.get(q.name, default) for q in self.outputs)], dtype=float)

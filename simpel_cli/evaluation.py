@@ -159,6 +159,8 @@ def bootstrap(
     means = (counts @ sums) / (counts @ sizes)[:, None]
     shape = (-1, *points.shape[1:])
     value = float(statistic(flat.mean(axis=0).reshape(1, *points.shape[1:]))[0])
+    if n_blocks == 1:
+        return Estimate(value, np.nan, np.nan)  # one block says nothing of the spread between blocks
     low, high = np.quantile(statistic(means.reshape(shape)), [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
@@ -269,8 +271,8 @@ def rollout(
         path.append(encoded)
     per_state, i = [], 0
     for q in encoding.states:
-        # the noise of an angle is that of its (sin, cos) pair
-        per_state.append(np.hypot(noise[i], noise[i + 1]) / 2**0.5 if q.periodic else noise[i])
+        # an angle's variance is the sum of those of its sine, s^2 cos^2, and cosine, s^2 sin^2
+        per_state.append(np.hypot(noise[i], noise[i + 1]) if q.periodic else noise[i])
         i += 2 if q.periodic else 1
     return encoding.decode(np.stack(path)), np.array(per_state)
 

@@ -161,9 +161,9 @@ class NoiseModel:
     Args:
         learn: learn it, or keep the initial value.
         floor: smallest standard deviation when learned.
-        measured_share: nor does it fall below this share of the measurement noise that the data declare or show. A
-            network that goes through every one of a few points would else learn that there is no noise. 0.7 is the
-            sine's or cosine's share of an angle's noise.
+        measured_share: nor does it fall below this share of the measurement noise that the data YAML declares. A network
+            that goes through every one of a few points would else learn that there is no noise. 0.7 is the sine's or
+            cosine's share of an angle's noise. (An estimate from the data is an upper bound, hence no floor.)
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.
         rate: its learning rate as a multiple of the networks'. One number per output has far less to learn than a
@@ -177,10 +177,12 @@ class NoiseModel:
     least_init: float = 0.1
     rate: float = 10.0
 
-    def start(self, measured: Float[Numbers, " dy"]) -> tuple[Float[Numbers, " dy"], Float[Numbers, " dy"]]:
-        """Return initial value and floor of sigma for a measurement noise (0 where unknown)."""
+    def start(
+        self, measured: Float[Numbers, " dy"], declared: Float[Numbers, " dy"]
+    ) -> tuple[Float[Numbers, " dy"], Float[Numbers, " dy"]]:
+        """Return initial value and floor of sigma for a measured and a declared noise (0 where unknown)."""
         init = np.maximum(measured, self.least_init)
-        return init, np.clip(self.measured_share * np.asarray(measured), self.floor, 0.99 * init)
+        return init, np.clip(self.measured_share * np.asarray(declared), self.floor, 0.99 * init)
 
     def init(self, sigma: Float[Numbers, " dy"], floor: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return rho for a standard deviation."""

@@ -161,10 +161,18 @@ def _horizon(path: Path) -> Any:
     return figure
 
 
+def _line(row: dict[str, Any]) -> str:
+    """Name of the line that a row of a sweep belongs to: its method, and every swept key but seed and training size."""
+    swept = [w for w in row["run"].split() if "=" in w]
+    own = [w for w in swept if not w.startswith(("method=", "data.n_train=", "run.seed="))]
+    return " ".join([row["method"], *own])
+
+
 def draw_sweep(path: Path, metric: str, output: str = "joint") -> Path | None:
     """Draw a test metric against the number of training transitions from `sweep.parquet`.
 
-    A line per method (median over seeds), a band from the smallest to the largest seed, a panel per data set.
+    A line per method and further swept key (median over seeds), a band from the smallest to the largest seed, a
+    panel per data set.
     Returns None where no run has the metric.
     """
     rows = [r for r in read_metrics(path) if r["split"] == "test" and r["metric"] == metric and r["output"] == output]
@@ -174,11 +182,11 @@ def draw_sweep(path: Path, metric: str, output: str = "joint") -> Path | None:
     figure, axes = _figure(len(panels), 4.6, 3.4)
     for axis, panel in zip(axes, panels, strict=True):
         own = [r for r in rows if (r["experiment"], r["data"]) == panel]
-        for j, method in enumerate(_names(r["method"] for r in own)):
-            sizes = sorted({r["n_train"] for r in own if r["method"] == method})
-            values = [[r["value"] for r in own if r["method"] == method and r["n_train"] == n] for n in sizes]
+        for j, line in enumerate(_names(_line(r) for r in own)):
+            sizes = sorted({r["n_train"] for r in own if _line(r) == line})
+            values = [[r["value"] for r in own if _line(r) == line and r["n_train"] == n] for n in sizes]
             colour = COLOURS[j % 7]
-            axis.plot(sizes, [np.median(v) for v in values], marker="o", markersize=4, color=colour, label=method)
+            axis.plot(sizes, [np.median(v) for v in values], marker="o", markersize=4, color=colour, label=line)
             axis.fill_between(sizes, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.2)
         ticks = sorted({r["n_train"] for r in own})
         axis.set(title=panel[0], xlabel="training transitions", ylabel=f"test {metric.upper()}", xscale="log")

@@ -4,6 +4,7 @@ Normalisation is the same for every method: inputs by the box of the domain, tar
 draws of the simulator over that box. Training data never enter it.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -26,6 +27,9 @@ NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
 WORLD_POINTS, WORLD_DRAWS = 200, 16  # of the normaliser, where a query costs a simulation and not a microsecond
 SCALE_POINTS, SCALE_DRAWS = 128, 512
 DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
+
+
+MOST_CHANGE = 100.0  # times the declared range of a state, in one transition
 
 
 class System(NamedTuple):
@@ -100,11 +104,21 @@ def normaliser_of(system: System, key: PRNGKeyArray) -> Normaliser:
     y_mean, spread = values.mean(axis=0), values.std(axis=0)
     gap = system.encoding.per_target(system.source.gap, np.nan)
     std = np.sqrt(spread**2 + np.where(np.isnan(gap), DEFAULT_GAP_FRACTION * spread, gap) ** 2)
+    size = dict.fromkeys(system.encoding.y_names, 0.0) | {
+        q.name: max(abs(q.low), abs(q.high)) for q in system.encoding.states
+    }
     for name, value in zip(system.encoding.y_names, std, strict=True):
-        if not (np.isfinite(value) and value > 0):
+        if not (np.isfinite(value) and value > 1e-12 * max(1.0, size[name])):
             raise ConfigError(
                 f"sim: the change of `{name}` in one transition has standard deviation {value} over the declared ranges. "
                 "An output that never changes (or overflows) cannot be learned: check ranges and dynamics."
+            )
+    for q in system.encoding.states:
+        change = 0.0 if q.periodic else std[system.encoding.y_names.index(q.name)]
+        if change > MOST_CHANGE * (q.high - q.low):
+            raise ConfigError(
+                f"sim: in one transition `{q.name}` changes by {change:.3g} {q.unit} (standard deviation), its declared "
+                f"range is {q.high - q.low:.3g}. The integration is unstable: raise sim.substeps, or narrow the ranges."
             )
     x_mean, x_std = system.domain.x_moments()
     return Normaliser(x_mean, x_std, y_mean, std)
@@ -124,7 +138,8 @@ def assemble(
     prior: SimulatorPrior | GPPrior,
     score: object,
     training: list[tuple[np.ndarray, np.ndarray]],
-    noise_std: dict[str, float],
+    noise_std: Mapping[str, float],
+    declared_noise: Mapping[str, float],
     *,
     noise: NoiseModel,
     pool: int,
@@ -139,7 +154,8 @@ def assemble(
         prior: prior declaration.
         score: score estimator.
         training: inputs (m, dx) and targets (m, dy) in data units, one pair per seed, all of one length.
-        noise_std: measurement noise per state and output, in its unit.
+        noise_std: measurement noise per state and output, in its unit, declared or estimated.
+        declared_noise: what of it was declared, and so is no upper bound.
         noise: of the likelihood.
         pool: number of domain points of a bank (for worlds).
         keys: one per seed, for draws of the prior that are made here.
@@ -147,9 +163,11 @@ def assemble(
     """
     dtype = jnp.dtype(precision)
     encoding = system.encoding
+    _refuse_lost_digits(encoding, np.asarray(normaliser.y_std), dtype)
     bound = prior.bind(system.transition, *system.dims, np.asarray(normaliser.x_std))
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
-    noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma))
+    declared = encoding.per_target(declared_noise, 0.0) / normaliser.y_std
+    noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma, declared))
     problems, scales = [], []
     for (x, y), key in zip(training, keys, strict=True):
         length = padded_length(len(x))
@@ -176,6 +194,19 @@ def assemble(
     setting = Setting(bound, score, lambda key, n: system.domain.sample(key, n, dtype))  # type: ignore[arg-type]
     gap_scale = scales[0] * normaliser.y_std if prior.gap is not None else None
     return Assembled(setting, jax.tree.map(stack, *problems), gap_scale)
+
+
+def _refuse_lost_digits(encoding: Encoding, y_std: np.ndarray, dtype: jnp.dtype) -> None:
+    """Refuse a precision in which the change of a state drowns in the state's rounding."""
+    for q in encoding.states:
+        if q.periodic:
+            continue
+        size, change = max(abs(q.low), abs(q.high)), y_std[encoding.y_names.index(q.name)]
+        if float(jnp.finfo(dtype).eps) * size > 0.01 * change:
+            raise ConfigError(
+                f"run.precision: {dtype.name} cannot hold a change of {change:.3g} {q.unit} in `{q.name}`, which is as large "
+                f"as {size:.3g}. Use run.precision=float64, or declare the state as a difference from a reference."
+            )
 
 
 def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: int, key: PRNGKeyArray) -> Bank | None:

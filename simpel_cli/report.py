@@ -46,8 +46,8 @@ FIGURES = {
     "calibration": ("Calibration", "Share of test targets inside the central region of a stated probability."),
     "free_run": (
         "Free run",
-        "The model runs on its own predictions along the measured inputs. An error above the claimed standard deviation "
-        "means that one-step noise does not explain it: look for a missing effect.",
+        "The model runs on its own predictions along the measured inputs. The claimed standard deviation is that "
+        "between the particles, plus the noise of one measurement. An error well above it asks for a better simulator.",
     ),
 }
 

@@ -142,7 +142,7 @@ class Manifest:
         """Write the manifest with a status: running, done, interrupted or failed."""
         record = {
             "command": self.command,
-            "command_line": " ".join(["simpel", *sys.argv[1:]]),
+            "command_line": _command_line(),
             "status": status,
             "error": error,
             "seed": self.settings.seed,
@@ -227,6 +227,12 @@ def make_directory(path: Path, key: str = "hydra.run.dir") -> Path:
             f"{key}: cannot write to {path} ({error.strerror}). Choose another place: {key}=DIR."
         ) from error
     return path
+
+
+def _command_line() -> str:
+    """Return what was typed; while Hydra composes, the words stand behind the verb in place of the program."""
+    words = [word.removeprefix("++") for word in sys.argv]
+    return " ".join(["simpel", *(words if words and "/" not in words[0] else words[1:])])
 
 
 def _version(name: str) -> str | None:

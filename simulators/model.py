@@ -330,6 +330,11 @@ def _variable(path: str, name: str, node: Any) -> Quantity:
     periodic = node.get("periodic", False)
     if not isinstance(periodic, bool):
         raise ModelError(f"{path}.periodic: {periodic!r} is not allowed; write true or false")
+    if periodic and _unit(path, node) not in ("rad", ""):
+        raise ModelError(
+            f"{path}.unit: {node['unit']!r} is not allowed for a periodic state, whose sine and cosine are learned; use rad "
+            "(convert the column of the measurements, too)"
+        )
     return Quantity(name, _unit(path, node), *_range(path, node), periodic=periodic)
 
 

@@ -207,8 +207,8 @@ def test_free_run_of_the_truth_has_no_error() -> None:
     assert run is not None
     assert run.error.shape == (2 * 3, HORIZON + 1, 2)
     np.testing.assert_allclose(run.error, 0, atol=1e-9)
-    # without spread, the noise is left; that of the angle is that of its pair
-    np.testing.assert_allclose(run.std[..., 0], (0.003**2 + 0.004**2) ** 0.5 / 2**0.5, rtol=1e-6)
+    # without spread, the noise is left; the variance of the angle is the sum of those of its pair
+    np.testing.assert_allclose(run.std[..., 0], 0.005, rtol=1e-6)
     np.testing.assert_allclose(run.std[..., 1], 0.05, rtol=1e-6)
     rows = {(r["metric"], r["output"]): r["value"] for r in free_run_table(run, encoding, 0.05)}
     assert rows["free_run_rmse@2s", "phi"] == pytest.approx(0, abs=1e-9)

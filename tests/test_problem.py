@@ -43,7 +43,7 @@ def assembled(system, prior, n=6, seeds=1):
     y = exact(states, inputs, np.ones((n, 1))) - states + 0.3 * states**2
     normaliser = normaliser_of(system, KEY)
     return normaliser, assemble(
-        system, normaliser, prior, Gaussian(), [(x, y)] * seeds, {"x": 0.001},
+        system, normaliser, prior, Gaussian(), [(x, y)] * seeds, {"x": 0.001}, {},
         noise=NoiseModel(), pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32",
     )  # fmt: skip
 
@@ -131,10 +131,10 @@ def test_wrong_answers_of_a_world_are_named():
 
 def test_learned_noise_starts_at_and_stays_above_what_was_measured():
     noise = NoiseModel(floor=1e-3, measured_share=0.7, least_init=0.1)
-    init, floor = noise.start(np.array([0.0, 0.02, 0.5]))
+    init, floor = noise.start(np.array([0.0, 0.02, 0.5]), np.array([0.0, 0.02, 0.5]))
     np.testing.assert_allclose(init, [0.1, 0.1, 0.5])
     np.testing.assert_allclose(floor, [1e-3, 0.014, 0.35])
     rho = noise.init(jnp.asarray(init), jnp.asarray(floor))
     np.testing.assert_allclose(noise.std(rho, jnp.asarray(floor)), init, rtol=1e-9)
     np.testing.assert_allclose(noise.std(jnp.full(3, -50.0), jnp.asarray(floor)), floor)
-    assert NoiseModel(measured_share=1.0).start(np.array([0.3]))[1][0] < 0.3  # room for the initial value above it
+    assert NoiseModel(measured_share=1.0).start(np.array([0.3]), np.array([0.3]))[1][0] < 0.3

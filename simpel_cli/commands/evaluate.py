@@ -10,7 +10,7 @@ from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, did_you_mean
 from simpel_cli.records import write_metrics, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied
+from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit
 
@@ -49,6 +49,9 @@ def evaluate(job: Job) -> None:
             )
             if judged_on.system.encoding != study.system.encoding:
                 raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
+            if sha256(judged_on.recording.files[0]) in (record.get("inputs_sha256") or {}).values():
+                # the run's own file: another split of it would judge the model on what it was trained on
+                judged_on = study
         manifest.add_inputs(judged_on.recording.files)
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")

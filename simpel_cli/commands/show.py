@@ -124,6 +124,8 @@ def _by_metric(rows: list[dict[str, Any]]) -> Values:
 
 def _shown(estimate: tuple[float, float, float]) -> str:
     value, low, high = estimate
+    if np.isnan(low):
+        return f"{value:.3g}"
     return f"{value:.3g} ({low:.3g}..{high:.3g})"
 
 
@@ -132,9 +134,12 @@ def _table(study: Study, values: Values) -> dict[str, Any]:
     names = [*zip(encoding.y_names, encoding.y_units, strict=True), ("joint", "1")]
     rows = []
     for name, unit in names:
-        label = name if unit in ("1", "") else f"{name} [{unit}]"
-        rows.append((label, *(_shown(values[m, name]) for m in METRICS)))
+        rows.append((_named(name, unit), *(_shown(values[m, name]) for m in METRICS)))
     return {"head": ("change in one step", *HEAD), "rows": rows}
+
+
+def _named(name: str, unit: str) -> str:
+    return name if unit in ("1", "") else f"{name} [{unit}]"
 
 
 def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
@@ -143,7 +148,7 @@ def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
     if not metrics:
         return None
     rows = [
-        (f"{q.name} [{q.unit}]", *(_shown(values[m, q.name]) for m in metrics)) for q in study.system.encoding.states
+        (_named(q.name, q.unit), *(_shown(values[m, q.name]) for m in metrics)) for q in study.system.encoding.states
     ]
     return {"head": ("free run, RMSE", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
 
@@ -169,6 +174,6 @@ def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {source or directory}{own} data={chosen['data']}          # or other measurements",
+        f"simpel evaluate {source or directory}          # with data=NAME: on other measurements",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]

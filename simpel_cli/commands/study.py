@@ -28,18 +28,18 @@ class Evaluation:
     """The `evaluation:` group.
 
     Args:
-        horizon: length of the free runs, s.
+        horizon: length of the free runs, s; null = 20 transitions.
     """
 
-    horizon: float = 1.0
+    horizon: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.horizon > 0:
+        if self.horizon is not None and not self.horizon > 0:
             raise ConfigError(f"evaluation.horizon: got {self.horizon}; it must be positive (s).")
 
     def steps(self, dt: float) -> int:
         """Number of transitions in the horizon, at least 1."""
-        return max(1, round(self.horizon / dt))
+        return 20 if self.horizon is None else max(1, round(self.horizon / dt))
 
 
 class Study(NamedTuple):
@@ -148,6 +148,7 @@ def prepare(study: Study) -> Fitted:
         study.score,
         training,
         study.recording.noise_std,
+        study.measurements.noise_std,
         noise=study.method.noise,
         pool=study.method.pool,
         keys=[stream(seed, "prior") for seed in settings.all_seeds],

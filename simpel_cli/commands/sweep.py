@@ -27,6 +27,7 @@ class Outcome(NamedTuple):
     directory: Path
     code: int  # exit code that the job would have had as a command
     error: str
+    words: str = ""  # the overrides that tell this job from the others
 
 
 class Jobs:
@@ -60,6 +61,7 @@ class Jobs:
             with contextlib.suppress(BrokenProcessPool, KeyboardInterrupt):
                 self.outcomes.append(future.result(timeout=60))
             raise Interrupted("the sweep was stopped; finished jobs are kept.") from None
+        outcome = outcome._replace(words=job.words)
         self.outcomes.append(outcome)
         self._say(job, outcome, perf_counter() - began)
         if outcome.code == Interrupted.exit_code:
@@ -129,7 +131,8 @@ def _collect(outcomes: list[Outcome], terminal: Terminal) -> None:
         with contextlib.suppress(SimpelError):
             if read_manifest(outcome.directory)["status"] == "done":
                 found = read_metrics(outcome.directory / "metrics.parquet")
-                rows += [row for row in found if row["split"] == "test"]
+                name = outcome.words or outcome.directory.name
+                rows += [row | {"run": name} for row in found if row["split"] == "test"]
     if not rows:
         return
     path = write_metrics(root / "sweep.parquet", rows, {})

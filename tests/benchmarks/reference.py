@@ -54,7 +54,7 @@ def fit(arrays: dict, method: str, steps: int, seeds: int, scale: str | float, o
     rule = build(node("method", method) | {"steps": steps} | overrides, "method")
     pair = (np.asarray(arrays["x_train"], float), np.asarray(arrays["y_train_diff"], float))
     assembled = assemble(
-        system, normaliser, prior_of(method, scale), Gaussian(), [pair] * seeds, NOISE,
+        system, normaliser, prior_of(method, scale), Gaussian(), [pair] * seeds, NOISE, NOISE,
         noise=rule.noise, pool=rule.pool, keys=[stream(s, "prior") for s in range(seeds)], precision="float32",
     )  # fmt: skip
     keys = jnp.stack([stream(s, "train") for s in range(seeds)])
