@@ -251,7 +251,7 @@ def launch(
     if "--cfg" not in flags:
         _refuse_other_runs(overrides)
     register_resolvers()
-    known = _top_level(verb)
+    known, swept = _top_level(verb), swept_keys(overrides)
 
     def entry(config: Any) -> Any:
         try:
@@ -265,7 +265,7 @@ def launch(
             if config_dir is not None and "choices" in plain:
                 plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with
             given = [w.removeprefix("++") for w in hydra_config.overrides.task]
-            return task(Job(plain, directory, folder, " ".join(w for w in given if w not in overrides)))
+            return task(Job(plain, directory, folder, " ".join(w for w in given if w.partition("=")[0] in swept)))
         except Exception as error:
             raise _Stopped from error
 
@@ -294,6 +294,14 @@ def count_jobs(overrides: list[str]) -> int:
 
     parsed = OverridesParser.create().parse_overrides(checked(overrides))
     return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
+
+
+def swept_keys(overrides: list[str]) -> set[str]:
+    """Return the keys to which a multirun gives several values."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_overrides(checked(overrides))
+    return {o.key_or_group for o in parsed if o.is_sweep_override()}
 
 
 def checked(overrides: list[str]) -> list[str]:

@@ -139,7 +139,7 @@ class TestFit:
         # one program trains them side by side; sums are taken in another order, so not to the last bit
         for key in [k for k in alone if k[1] in ("loss", "rmse", "noise_std")]:
             assert ours[key] == pytest.approx(alone[key], rel=0.05)
-        assert load_file(tmp_path / "both" / "checkpoint" / "state.safetensors")[".noise"].shape[0] == 2
+        assert load_file(tmp_path / "both" / "checkpoint" / "state.safetensors")["['state'].noise"].shape[0] == 2
 
     def test_float64(self, tmp_path: Path) -> None:
         run(tmp_path, *FIT, "hydra.run.dir=run", "run.precision=float64")
@@ -229,7 +229,10 @@ class TestSweep:
         assert "2 of 4 jobs failed, the others are collected" in result.err
         assert "method.learning_rate: got -1.0; it must be positive" in result.err
         table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {(row["run"], row["seed"]) for row in table} == {("0", 0), ("1", 1)}
+        assert {(row["run"], row["seed"]) for row in table} == {
+            ("method.learning_rate=0.001 run.seed=0", 0),
+            ("method.learning_rate=0.001 run.seed=1", 1),
+        }
         assert {row["split"] for row in table} == {"test"}
         status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(4)]
         assert status == ["done", "done", "failed", "failed"]

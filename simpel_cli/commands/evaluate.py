@@ -40,7 +40,7 @@ def evaluate(job: Job) -> None:
         study = open_study(config, run)
         refuse_changed_inputs(record, study.recording.files)
         fitted = prepare(study)
-        step, state = checkpointed_state(run, fitted)
+        step, state, fitted = checkpointed_state(run, fitted)
         judged_on = study
         if own.get("data"):
             choices = trained["choices"] | {"data": own["choices"].get("data", "")}

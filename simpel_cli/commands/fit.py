@@ -18,6 +18,7 @@ from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, w
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
 LOG_EVERY = 50  # steps per row of the metric table
+DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
 
 
 def fit(job: Job) -> None:
@@ -54,7 +55,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     terminal = Terminal(study.settings.quiet, directory / "run.log")
     fitted = prepare(study)
     describe(terminal, study, fitted)
-    start, state = _restored(directory, fitted) if resume else (0, None)
+    start, state, fitted = _restored(directory, fitted) if resume else (0, None, fitted)
     program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
     constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}
     began = time.perf_counter()
@@ -103,7 +104,9 @@ def _train(
             state = stretch.state
             # rows first: a kill in between leaves rows beyond the checkpoint, which resume cuts off and makes again
             metrics.add(_training_rows(study, stretch, encoding, y_std))
-            save_checkpoint(directory / "checkpoint", _leaves(state), {"step": stretch.step, "command": "fit"})
+            save_checkpoint(
+                directory / "checkpoint", _leaves(_kept(fitted, state)), {"step": stretch.step, "command": "fit"}
+            )
             loss = float(stretch.info.loss[:, -LOG_EVERY:].mean())
             noise = " ".join(f"{v:.2g}" for v in stretch.info.noise_std[:, -1].mean(axis=0) * y_std)
             update(stretch.step, f"loss {loss:.3g}  noise {noise}  {compile_note}")
@@ -130,21 +133,30 @@ def _leaves(tree: Any) -> dict[str, np.ndarray]:
     return {jax.tree_util.keystr(p): np.asarray(v) for p, v in jax.tree_util.tree_leaves_with_path(tree)}
 
 
-def _restored(directory: Path, fitted: Fitted) -> tuple[int, Any]:
+def _kept(fitted: Fitted, state: Any) -> dict[str, Any]:
+    """Return what a checkpoint holds: the state, and of the problem what was drawn or chosen rather than measured.
+
+    Another version of JAX may draw another normaliser; networks that were trained in one are worth nothing in another.
+    """
+    problems = fitted.assembled.problems
+    return {"state": state, "problem": {name: getattr(problems, name) for name in DRAWN}}
+
+
+def _restored(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitted]:
     """Read the checkpoint, if there is one."""
     if not (directory / "checkpoint" / "state.safetensors").exists():
-        return 0, None  # stopped before the first checkpoint: the run starts over, with the same result
+        return 0, None, fitted  # stopped before the first checkpoint: the run starts over, with the same result
     return checkpointed_state(directory, fitted)
 
 
-def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any]:
-    """Return the step and the state of a run's checkpoint.
+def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitted]:
+    """Return the step and the state of a run's checkpoint, and the problem in the units that it was trained in.
 
     Raises:
         ConfigError: no checkpoint, a damaged one, or one of another configuration.
     """
     arrays, facts = load_checkpoint(directory / "checkpoint")
-    shape = loop.state_shape(fitted.bind, fitted.assembled.problems, fitted.keys)
+    shape = _kept(fitted, loop.state_shape(fitted.bind, fitted.assembled.problems, fitted.keys))
     paths, structure = jax.tree_util.tree_flatten_with_path(shape)
     leaves = []
     for path, expected in paths:
@@ -157,4 +169,6 @@ def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any]:
                 f"{expected.dtype}{list(expected.shape)}. The checkpoint belongs to another configuration."
             )
         leaves.append(jax.numpy.asarray(found))
-    return int(facts["step"]), jax.tree_util.tree_unflatten(structure, leaves)
+    kept = jax.tree_util.tree_unflatten(structure, leaves)
+    assembled = fitted.assembled._replace(problems=fitted.assembled.problems._replace(**kept["problem"]))
+    return int(facts["step"]), kept["state"], fitted._replace(assembled=assembled)

@@ -118,6 +118,7 @@ def _work(job: Job) -> Outcome:
         return Outcome(job.directory, error.exit_code, str(error))
     except Exception:
         text = traceback.format_exc()
+        job.directory.mkdir(parents=True, exist_ok=True)
         (job.directory / "traceback.txt").write_text(text)
         return Outcome(job.directory, 1, f"{text.splitlines()[-1]} (see traceback.txt in its directory)")
     return Outcome(job.directory, 0, "")
