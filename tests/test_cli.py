@@ -238,7 +238,7 @@ class TestSweep:
         assert status == ["done", "done", "failed", "failed"]
         single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
         assert single.code == 0
-        of_sweep = [r["value"] for r in table if r["run"] == "1"]
+        of_sweep = [r["value"] for r in table if r["seed"] == 1]
         assert of_sweep == [r["value"] for r in rows(tmp_path / "single", split="test")]
 
     def test_a_worker_that_is_killed_costs_one_job(self, tmp_path: Path) -> None:
