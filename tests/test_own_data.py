@@ -20,10 +20,10 @@ def blocks(language: str) -> list[str]:
 
 
 def commands(verb: str) -> list[str]:
-    """Commands of the walk-through, those with `--config-dir my`, without comments; in code blocks or in a sentence."""
+    """Commands of the walk-through, those with `--config-dir my` or on its run, without comments."""
     lines = [line.split("  #")[0].strip() for block in blocks("") for line in block.splitlines()]
-    lines += re.findall(r"`(simpel [^`]+)`", README)
-    return [line for line in lines if line.startswith(f"simpel {verb} ") and "--config-dir my" in line]
+    lines += [line for line in re.findall(r"`(simpel [^`]+)`", README) if "--config-dir my" in line]
+    return [line for line in lines if re.match(rf"simpel {verb} (.*--config-dir my|RUN_DIR$)", line)]
 
 
 def words(command: str, **replaced: str) -> list[str]:
