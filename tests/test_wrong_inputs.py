@@ -273,8 +273,8 @@ class TestOfARun:
 
     def test_evaluate_on_other_quantities(self, folder: Path) -> None:
         result = simpel(folder, "evaluate", "run", "data=pendulum")
-        assert result.code == DATA
-        assert "column 's' is missing in measurements.parquet" in result.err
+        assert result.code == CONFIG
+        assert "data.noise_std.phi: the simulator has no such quantity (it has: s, v)" in result.err
 
     def test_evaluate_keeps_the_settings_of_the_fit(self, folder: Path) -> None:
         result = simpel(folder, "evaluate", "run", "run.seeds=3")
