@@ -107,6 +107,27 @@ def evaluate(
 
 
 @app.command()
+def discover(
+    overrides: Overrides = None,
+    config_dir: ConfigDir = None,
+    cfg: Cfg = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 5 unless the verdict is `effect`.")] = False,
+) -> None:
+    """Find what the simulator leaves unexplained, name the cause, add it, and report the error before and after.
+
+    Examples:
+      simpel discover experiment=hidden_pendulum
+
+      simpel discover --config-dir my sim=rig data=rig effect=[viscous_friction,coulomb_friction,input_delay]
+    """
+    from functools import partial
+
+    from simpel_cli.commands.discover import discover as task
+
+    _launch("discover", partial(task, strict=strict), overrides, config_dir, cfg)
+
+
+@app.command()
 def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
     """Fit every combination of values and collect the results.
 

@@ -21,7 +21,7 @@ from simpel_cli.problem import Assembled, System, assemble, normaliser_of, syste
 from simpel_cli.run import Settings, configure, stream
 
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
-GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation", "simulation")
+GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Study(NamedTuple):
 def settings_of(config: dict[str, Any]) -> Settings:
     """Build the `run:` group and refuse keys that no verb has."""
     for key in config:
-        if key not in (*GROUPS, "choices", "run_dir", "out"):
+        if key not in (*GROUPS, "choices", "run_dir", "out", "close"):
             raise ConfigError(f"{key}: no such key.{did_you_mean(key, list(GROUPS))} (groups: {', '.join(GROUPS)})")
     return build(config.get("run") or {}, "run", default=Settings)
 
