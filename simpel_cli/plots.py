@@ -1,5 +1,6 @@
 """Figures of a run, drawn from its Parquet files only."""
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -93,11 +94,12 @@ def _learning_curves(path: Path) -> Any:
 
 
 def _predictions(path: Path) -> Any:
-    """Measured target against prediction with bands, along the longest test episode of the first seed."""
+    """Measured target against prediction with bands, along the longest test segment of the first seed."""
     table = _columns(path)
     first = table["seed"] == table["seed"][0]
-    episodes, counts = np.unique(table["episode"][first], return_counts=True)
-    chosen = first & (table["episode"] == episodes[counts.argmax()])
+    pieces = Counter(zip(table["episode"][first], table["segment"][first], strict=True))
+    (episode, segment), _ = pieces.most_common(1)[0]
+    chosen = first & (table["episode"] == episode) & (table["segment"] == segment)
     outputs = _names(table["output"])
     figure, axes = _figure(len(outputs))
     for axis, output in zip(axes, outputs, strict=True):

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from command_line import TINY, environment, process, rig, simpel, start
+from command_line import ROOT, TINY, environment, process, rig, simpel, start
 from safetensors.numpy import load_file
 
 from simpel_cli.run import sha256
@@ -98,6 +98,17 @@ class TestFit:
             assert of == ["sin(phi)", "cos(phi)", "omega", "joint"]
             assert {row["output"] for row in test if row["metric"] == f"{metric}_low"} == set(of)
         assert {row["unit"] for row in test if row["metric"] == "rmse" and row["output"] == "omega"} == {"rad/s"}
+
+    def test_predictions_carry_the_users_episodes_and_times(self, fitted: Path) -> None:
+        found = pq.read_table(fitted / "predictions.parquet").to_pylist()
+        data = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pylist()
+        speed = {(str(row["episode"]), round(row["t"], 6)): row["omega"] for row in data if row["split"] == "test"}
+        assert {row["episode"] for row in found} == {episode for episode, _ in speed}
+        assert {row["segment"] for row in found} == {1}
+        for row in found:
+            if row["output"] == "omega":
+                now, then = (speed[row["episode"], round(row["time"] + dt, 6)] for dt in (0.0, 0.05))
+                assert row["measured"] == pytest.approx(then - now, abs=1e-9)
 
     def test_config_is_resolved_and_builds_again(self, fitted: Path) -> None:
         text = (fitted / "config.yaml").read_text()

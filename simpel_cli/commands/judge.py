@@ -7,7 +7,8 @@ import numpy as np
 
 from simpel_cli import evaluation as ev
 from simpel_cli.commands.study import Study
-from simpel_cli.data import transitions
+from simpel_cli.data import Places, Transitions, origins, places, transitions
+from simpel_cli.encoding import Encoding
 from simpel_cli.records import write_table
 
 
@@ -29,6 +30,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: i
     episodes = study.recording.test
     pairs = transitions(episodes, encoding.stack)
     x, y = ev.test_arrays(pairs, encoding)
+    where = _places(study, pairs)
     blocks = ev.blocks_of(pairs.episode, pairs.row, horizon)
     follow = tuple(e for e in episodes if e.next_states is None)
     # the longest roll-out that an episode has room for
@@ -39,7 +41,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: i
     for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
         result = ev.one_step(posterior, x, y)
         found = ev.one_step_table(result, blocks, encoding)
-        tables["predictions"].append(_predictions(seed, pairs, y, result, encoding, dt))
+        tables["predictions"].append(_predictions(seed, where, y, result, encoding))
         tables["calibration"].append(_calibration(seed, result, encoding))
         run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None
         if run is not None:
@@ -52,16 +54,27 @@ def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: i
     return Judged(rows, blocks.kind, horizon * dt if run is not None else None)
 
 
+def _places(study: Study, pairs: Transitions) -> Places:
+    """Where the test transitions begin."""
+    train, test = study.recording.train, study.recording.test
+    return places(test, origins((*train, *test))[len(train) :], pairs.episode, pairs.row)
+
+
 def _predictions(
-    seed: int, pairs: Any, y: np.ndarray, result: ev.OneStep, encoding: Any, dt: float
+    seed: int, where: Places, y: np.ndarray, result: ev.OneStep, encoding: Encoding
 ) -> dict[str, np.ndarray]:
-    """One row per test transition and output: measured and predicted target with its bands."""
+    """One row per test transition and output: measured and predicted target with its bands.
+
+    `episode` is the user's name; `segment` counts the pieces that checks or splits cut it into, `row` the rows of the
+    piece; `time` is that of the measurement that the step starts from.
+    """
     n, dy = y.shape
-    columns = {
+    return {
         "seed": np.full(n * dy, seed),
-        "episode": np.repeat(pairs.episode, dy),
-        "row": np.repeat(pairs.row, dy),
-        "time": np.repeat(pairs.row * dt, dy),
+        "episode": np.repeat(where.episode, dy),
+        "segment": np.repeat(where.segment, dy),
+        "row": np.repeat(where.row, dy),
+        "time": np.repeat(where.time, dy),
         "output": np.tile(encoding.y_names, n),
         "unit": np.tile(encoding.y_units, n),
         "measured": y.ravel(),
@@ -69,7 +82,6 @@ def _predictions(
         "std": result.std.ravel(),
         "epistemic_std": result.epistemic_std.ravel(),
     }
-    return columns
 
 
 def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.ndarray]:
