@@ -39,9 +39,9 @@ pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color
 FIGURES = {
     "learning_curves": ("Training", "A loss that still falls asks for more steps (method.steps)."),
     "predictions": (
-        "One step ahead, against measurement",
-        "The dark band is the model's own uncertainty, the light band adds the learned noise: 95 % of points lie inside it "
-        "when the model is right about itself.",
+        "Prediction against measurement",
+        "The dark band is the model's own uncertainty, the light band (or bar) adds the learned noise: 95 % of points lie "
+        "inside it when the model is right about itself.",
     ),
     "calibration": ("Calibration", "Share of test targets inside the central region of a stated probability."),
     "free_run": (

@@ -230,6 +230,13 @@ class TestSimulate:
         assert {row["output"] for row in found if row["metric"] == "nll"} == {"f", "joint"}
         assert not [row for row in found if str(row["metric"]).startswith("free_run")]
         assert not (tmp_path / "f" / "horizon.parquet").exists()
+        said = (tmp_path / "f" / "run.log").read_text()
+        assert "30 train / 10 test rows, 30 rows used " in said
+        assert "test (10 rows)" in said
+        assert re.search(r"  value +NLL", said)
+        assert "one step" not in said.lower()
+        assert "one step" not in (tmp_path / "f" / "report.html").read_text().split("<h2>Go on")[0].lower()
+        assert set(pq.read_table(tmp_path / "f" / "predictions.parquet")["kind"].to_pylist()) == {"value"}
 
 
 class TestSweep:

@@ -66,7 +66,7 @@ def _predictions(
     """One row per test transition and output: measured and predicted target with its bands.
 
     `episode` is the user's name; `segment` counts the pieces that checks or splits cut it into, `row` the rows of the
-    piece; `time` is that of the measurement that the step starts from.
+    piece; `time` is that of the measurement that the step starts from; `kind` is `change` in one step or `value`.
     """
     n, dy = y.shape
     return {
@@ -76,6 +76,7 @@ def _predictions(
         "row": np.repeat(where.row, dy),
         "time": np.repeat(where.time, dy),
         "output": np.tile(encoding.y_names, n),
+        "kind": np.tile(encoding.y_kinds, n),
         "unit": np.tile(encoding.y_units, n),
         "measured": y.ravel(),
         "mean": result.mean.ravel(),

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
@@ -26,8 +27,7 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
     )
     failed = [c for c in recording.checks if not c.ok]
     terminal.line(
-        f"{recording.files[0]}   {len(recording.train)} train / {len(recording.test)} test episodes, "
-        f"{len(fitted.training[0][0])} transitions used, dt {source.dt:g} s   "
+        f"{recording.files[0]}   {extent_of_split(recording)}, {_used(study, fitted)}   "
         f"checks {len(recording.checks) - len(failed)} ok" + (f", {len(failed)} to look at" if failed else ""),
         "data",
     )
@@ -38,6 +38,12 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (queried)"
     terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+
+
+def _used(study: Study, fitted: Fitted) -> str:
+    """What was trained on; a simulator without states has no step, hence no dt."""
+    used, source = len(fitted.training[0][0]), study.system.source
+    return f"{used} transitions used, dt {source.dt:g} s" if source.states else f"{used} rows used"
 
 
 def _gap_text(study: Study, fitted: Fitted) -> str:
@@ -62,10 +68,10 @@ def publish(
 ) -> None:
     """Print the test results, draw the figures, write the report, and say where things lie and what to type next."""
     values = _by_metric(judged.rows)
-    n_test = len(study.recording.test)
+    extent = extent_of_test(study.recording)
     terminal.line()
     nll, rmse, crps, inside = (values[m, "joint"] for m in ("nll", "rmse", "crps", "coverage_90"))
-    head = f"test ({n_test} episode{'s' if n_test > 1 else ''})"
+    head = f"test ({extent})"
     terminal.line(
         f"{head:<20}NLL {_shown(nll)}   RMSE {_shown(rmse)}   CRPS {_shown(crps)}   coverage of 90 %: {100 * inside[0]:.0f} %"
     )
@@ -78,7 +84,8 @@ def publish(
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
     next_commands = _next(study, directory, source)
     figures = draw_run(directory)
-    tables = [table | {"title": "One step ahead, held-out episodes"}]
+    what = "One step ahead" if study.system.encoding.states else "Predictions"
+    tables = [table | {"title": f"{what}, held-out data"}]
     if free is not None:
         tables.append(free | {"title": "Free run, root mean square error"})
     checks = {
@@ -91,7 +98,7 @@ def publish(
     report = write_report(
         directory / "report.html",
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
-        lead=f"{study.system.source.name} on {study.recording.files[0].name}, {n_test} test episodes, seeds {s.all_seeds}. "
+        lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
         tables=[*tables, checks],
         figures=figures,
@@ -131,11 +138,18 @@ def _shown(estimate: tuple[float, float, float]) -> str:
 
 def _table(study: Study, values: Values) -> dict[str, Any]:
     encoding = study.system.encoding
-    names = [*zip(encoding.y_names, encoding.y_units, strict=True), ("joint", "1")]
-    rows = []
-    for name, unit in names:
-        rows.append((_named(name, unit), *(_shown(values[m, name]) for m in METRICS)))
-    return {"head": ("change in one step", *HEAD), "rows": rows}
+    kinds = set(encoding.y_kinds)
+    mixed = len(kinds) > 1
+    names = [
+        _named(f"change of {name}" if mixed and kind == "change" else name, unit)
+        for name, unit, kind in zip(encoding.y_names, encoding.y_units, encoding.y_kinds, strict=True)
+    ]
+    rows = [
+        (shown, *(_shown(values[m, name]) for m in METRICS))
+        for shown, name in zip([*names, "joint"], [*encoding.y_names, "joint"], strict=True)
+    ]
+    head = "one step" if mixed else {"change": "change in one step", "value": "value"}[kinds.pop()]
+    return {"head": (head, *HEAD), "rows": rows}
 
 
 def _named(name: str, unit: str) -> str:
