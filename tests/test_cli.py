@@ -93,7 +93,7 @@ class TestFit:
         assert {row["metric"] for row in train} == {"loss", "mean_kernel", "noise_std"}
         test = [row for row in table if row["split"] == "test"]
         assert {row["step"] for row in test} == {100}
-        for metric in ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error"):
+        for metric in ("nll", "rmse", "nrmse", "mae", "crps", "coverage_90", "calibration_error"):
             of = [row["output"] for row in test if row["metric"] == metric]
             assert of == ["sin(phi)", "cos(phi)", "omega", "joint"]
             assert {row["output"] for row in test if row["metric"] == f"{metric}_low"} == set(of)
@@ -109,6 +109,16 @@ class TestFit:
             if row["output"] == "omega":
                 now, then = (speed[row["episode"], round(row["time"] + dt, 6)] for dt in (0.0, 0.05))
                 assert row["measured"] == pytest.approx(then - now, abs=1e-9)
+
+    def test_a_joint_error_of_mixed_units_is_kept_but_not_shown(self, fitted: Path) -> None:
+        joint = {row["metric"]: row for row in rows(fitted, split="test") if row["output"] == "joint"}
+        assert joint["rmse"]["unit"] == "mixed"  # rad/s, and none for sine and cosine
+        said = (fitted / "run.log").read_text()
+        (line,) = re.findall(r"^ +joint .*", said, re.M)
+        cells = re.split(r" {2,}", line.strip())
+        assert [cells[i] for i in (2, 4, 5)] == ["-"] * 3
+        assert cells[3].startswith(f"{joint['nrmse']['value']:.3g} (")
+        assert re.search(r"test \(3 episodes\) +NLL \S+ \(\S+\)   normalised RMSE \S+ \(\S+\)   coverage", said)
 
     def test_config_is_resolved_and_builds_again(self, fitted: Path) -> None:
         text = (fitted / "config.yaml").read_text()

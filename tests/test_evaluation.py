@@ -32,6 +32,7 @@ N, DY = 3000, 2
 ENCODING = Encoding((Quantity("a", "m", -1, 1), Quantity("b", "s", -1, 1)), (Quantity("u", "V", -1, 1),))
 OUTPUTS = (*ENCODING.y_names, "joint")
 NOISE = np.array([0.2, 3.0])
+SPREAD = np.array([0.4, 1.5])  # of the targets
 
 
 def synthetic(claimed: float, particles: int = 20) -> Posterior:
@@ -57,8 +58,15 @@ def data() -> tuple[np.ndarray, np.ndarray]:
     return x, x[:, :DY] + NOISE * rng.normal(size=(N, DY))
 
 
+def rows_of(
+    posterior: Posterior, data: tuple[np.ndarray, np.ndarray], encoding: Encoding = ENCODING
+) -> list[dict[str, object]]:
+    blocks = blocks_of(np.arange(N) // 10, np.zeros(N, int), 1)
+    return one_step_table(one_step(posterior, *data), blocks, encoding, SPREAD)
+
+
 def table(posterior: Posterior, data: tuple[np.ndarray, np.ndarray]) -> dict[tuple[str, str], float]:
-    rows = one_step_table(one_step(posterior, *data), blocks_of(np.arange(N) // 10, np.zeros(N, int), 1), ENCODING)
+    rows = rows_of(posterior, data)
     return {(str(r["metric"]), str(r["output"])): float(r["value"]) for r in rows}  # type: ignore[arg-type]
 
 
@@ -76,6 +84,21 @@ def test_calibrated_posterior(data: tuple[np.ndarray, np.ndarray]) -> None:
             assert t["crps", output] == pytest.approx(NOISE[i] / np.pi**0.5, rel=0.05)
     assert t["rmse", "joint"] == pytest.approx(np.hypot(*NOISE), rel=0.05)
     assert t["nll", "joint"] == pytest.approx(t["nll", "a"] + t["nll", "b"], abs=0.05)
+    # errors of half and of twice the spread, 0.2 m / 0.4 m and 3 s / 1.5 s
+    for output, expected in zip(OUTPUTS, (0.5, 2.0, (4.25 / 2) ** 0.5), strict=True):
+        assert t["nrmse", output] == pytest.approx(expected, rel=0.05)
+        assert t["nrmse_low", output] < t["nrmse", output] < t["nrmse_high", output]
+
+
+def test_joint_errors_have_a_unit_only_where_the_outputs_share_one(data: tuple[np.ndarray, np.ndarray]) -> None:
+    def units(encoding: Encoding) -> dict[object, object]:
+        return {r["metric"]: r["unit"] for r in rows_of(synthetic(1.0), data, encoding) if r["output"] == "joint"}
+
+    both_m = Encoding((Quantity("a", "m", -1, 1), Quantity("b", "m", -1, 1)), ENCODING.inputs)
+    for encoding, unit in ((ENCODING, "mixed"), (both_m, "m")):
+        found = units(encoding)
+        assert {found[m] for m in ("rmse", "mae", "crps", "rmse_low", "crps_high")} == {unit}
+        assert (found["nll"], found["nrmse"], found["coverage_90"]) == ("nat", "1", "1")
 
 
 @pytest.mark.parametrize(("claimed", "coverage"), [(0.5, 0.589), (2.0, 0.9990)])

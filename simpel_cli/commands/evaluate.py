@@ -56,7 +56,7 @@ def evaluate(job: Job) -> None:
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")
         terminal.line(f"simpel evaluate · {run} · step {step} · {judged_on.recording.files[0]}", style="bold")
-        judged = judge(judged_on, posteriors(study, fitted, state), directory, step)
+        judged = judge(judged_on, posteriors(study, fitted, state), fitted.target_std, directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
         write_metrics(directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])})
         publish(terminal, judged_on, judged, directory, dump(config), "evaluate", run)

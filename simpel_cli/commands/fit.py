@@ -66,7 +66,8 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
             "train_seconds": round(time.perf_counter() - began, 3),
             "n_train": len(fitted.training[0][0]),
         }
-        judged: Judged = judge(study, posteriors(study, fitted, state), directory, study.method.steps)
+        found = posteriors(study, fitted, state)
+        judged: Judged = judge(study, found, fitted.target_std, directory, study.method.steps)
         metrics.add(judged.rows)
         metrics.close()
     publish(terminal, study, judged, directory, dump(config), "fit")

@@ -20,10 +20,17 @@ class Judged(NamedTuple):
     horizon: float | None  # s, of the free runs; None: no episode is long enough
 
 
-def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: int) -> Judged:
+def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, directory: Path, step: int) -> Judged:
     """Evaluate the posterior of every seed on the test split.
 
     Writes `predictions.parquet`, `calibration.parquet` and `horizon.parquet` into `directory`.
+
+    Args:
+        study: what was fitted, with the measurements to judge it on.
+        posteriors: one per seed.
+        target_std: spread of the targets over the simulator's ranges, data units, shape (dy,).
+        directory: of the run.
+        step: that the posteriors are of.
     """
     encoding, dt = study.system.encoding, study.system.source.dt
     horizon = study.evaluation.steps(dt)
@@ -40,7 +47,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: i
     run = None
     for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
         result = ev.one_step(posterior, x, y)
-        found = ev.one_step_table(result, blocks, encoding)
+        found = ev.one_step_table(result, blocks, encoding, target_std)
         tables["predictions"].append(_predictions(seed, where, y, result, encoding))
         tables["calibration"].append(_calibration(seed, result, encoding))
         run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None

@@ -9,11 +9,24 @@ from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
+from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.plots import draw_run
 from simpel_cli.report import write_report
 
-HEAD = ("NLL", "RMSE", "MAE", "CRPS", "coverage of 90 %", "calibration error")
-METRICS = ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error")
+METRICS = {
+    "nll": "NLL",
+    "rmse": "RMSE",
+    "nrmse": "normalised RMSE",
+    "mae": "MAE",
+    "crps": "CRPS",
+    "coverage_90": "coverage of 90 %",
+    "calibration_error": "calibration error",
+}
+
+NOTE = (
+    "Normalised RMSE is in units of the simulator's own spread of the target over its declared ranges; jointly, the root "
+    "mean square over outputs. Joint errors in data units are shown where all outputs share a unit."
+)
 
 
 def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
@@ -70,11 +83,7 @@ def publish(
     values = _by_metric(judged.rows)
     extent = extent_of_test(study.recording)
     terminal.line()
-    nll, rmse, crps, inside = (values[m, "joint"] for m in ("nll", "rmse", "crps", "coverage_90"))
-    head = f"test ({extent})"
-    terminal.line(
-        f"{head:<20}NLL {_shown(nll)}   RMSE {_shown(rmse)}   CRPS {_shown(crps)}   coverage of 90 %: {100 * inside[0]:.0f} %"
-    )
+    terminal.line(f"{f'test ({extent})':<20}{_headline(study, values)}")
     table = _table(study, values)
     terminal.line(_aligned(table["head"], table["rows"]))
     free = _free_run_table(study, values)
@@ -85,7 +94,7 @@ def publish(
     next_commands = _next(study, directory, source)
     figures = draw_run(directory)
     what = "One step ahead" if study.system.encoding.states else "Predictions"
-    tables = [table | {"title": f"{what}, held-out data"}]
+    tables = [table | {"title": f"{what}, held-out data", "note": NOTE}]
     if free is not None:
         tables.append(free | {"title": "Free run, root mean square error"})
     checks = {
@@ -136,6 +145,15 @@ def _shown(estimate: tuple[float, float, float]) -> str:
     return f"{value:.3g} ({low:.3g}..{high:.3g})"
 
 
+def _headline(study: Study, values: Values) -> str:
+    """Joint results: errors in the outputs' common unit, or normalised where they have none in common."""
+    unit = joint_unit(study.system.encoding)
+    errors = ("nrmse",) if unit == MIXED else ("rmse", "crps")
+    shown = [f"NLL {_shown(values['nll', 'joint'])}"]
+    shown += [f"{_named(METRICS[m], '' if m == 'nrmse' else unit)} {_shown(values[m, 'joint'])}" for m in errors]
+    return "   ".join([*shown, f"coverage of 90 %: {100 * values['coverage_90', 'joint'][0]:.0f} %"])
+
+
 def _table(study: Study, values: Values) -> dict[str, Any]:
     encoding = study.system.encoding
     kinds = set(encoding.y_kinds)
@@ -146,10 +164,15 @@ def _table(study: Study, values: Values) -> dict[str, Any]:
     ]
     rows = [
         (shown, *(_shown(values[m, name]) for m in METRICS))
-        for shown, name in zip([*names, "joint"], [*encoding.y_names, "joint"], strict=True)
+        for shown, name in zip(names, encoding.y_names, strict=True)
     ]
+    unit = joint_unit(encoding)
+    # a sum over outputs of different units is kept in metrics.parquet, labelled as such; shown, it would mislead
+    hidden = IN_DATA_UNITS if unit == MIXED else ()
+    joint = ("-" if m in hidden else _shown(values[m, "joint"]) for m in METRICS)
+    rows.append((_named("joint", "" if unit == MIXED else unit), *joint))
     head = "one step" if mixed else {"change": "change in one step", "value": "value"}[kinds.pop()]
-    return {"head": (head, *HEAD), "rows": rows}
+    return {"head": (head, *METRICS.values()), "rows": rows}
 
 
 def _named(name: str, unit: str) -> str:

@@ -128,6 +128,11 @@ class Fitted(NamedTuple):
     training: list[tuple[np.ndarray, np.ndarray]]
     normaliser: Normaliser
 
+    @property
+    def target_std(self) -> np.ndarray:
+        """Spread of the targets over the simulator's ranges, in data units, as the networks were trained with."""
+        return np.asarray(self.assembled.problems.normaliser.y_std[0], dtype=float)
+
 
 def prepare(study: Study) -> Fitted:
     """Choose the training transitions of every seed and assemble the problems."""

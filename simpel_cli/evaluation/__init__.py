@@ -2,10 +2,20 @@
 
 from simpel_cli.evaluation.bootstrap import Blocks, Estimate, blocks_of, bootstrap
 from simpel_cli.evaluation.free_run import FreeRun, free_run, free_run_table, windows
-from simpel_cli.evaluation.one_step import LEVELS, OneStep, chi_squared_quantile, one_step, one_step_table
+from simpel_cli.evaluation.one_step import (
+    IN_DATA_UNITS,
+    LEVELS,
+    MIXED,
+    OneStep,
+    chi_squared_quantile,
+    joint_unit,
+    one_step,
+    one_step_table,
+)
 from simpel_cli.evaluation.posterior import CHUNK, Posterior, test_arrays
 
 __all__ = [
-    "CHUNK", "LEVELS", "Blocks", "Estimate", "FreeRun", "OneStep", "Posterior", "blocks_of", "bootstrap",
-    "chi_squared_quantile", "free_run", "free_run_table", "one_step", "one_step_table", "test_arrays", "windows",
+    "CHUNK", "IN_DATA_UNITS", "LEVELS", "MIXED", "Blocks", "Estimate", "FreeRun", "OneStep", "Posterior", "blocks_of",
+    "bootstrap", "chi_squared_quantile", "free_run", "free_run_table", "joint_unit", "one_step", "one_step_table",
+    "test_arrays", "windows",
 ]  # fmt: skip

@@ -98,16 +98,41 @@ STATISTICS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "coverage_90": ("inside", lambda m: m),
     "calibration_error": ("below", lambda m: np.abs(m - LEVELS).mean(axis=-1)),
 }
+IN_DATA_UNITS = ("rmse", "mae", "crps")
+MIXED = "mixed"  # the unit of a sum over outputs of different units
 
 
-def one_step_table(result: OneStep, blocks: Blocks, encoding: Encoding) -> list[dict[str, object]]:
-    """Return metric rows (metric, output, unit, value) with their interval ends as `<metric>_low`, `<metric>_high`."""
-    names, units = [*encoding.y_names, "joint"], [*encoding.y_units, "mixed"]
+def one_step_table(
+    result: OneStep, blocks: Blocks, encoding: Encoding, target_std: np.ndarray
+) -> list[dict[str, object]]:
+    """Return metric rows (metric, output, unit, value) with their interval ends as `<metric>_low`, `<metric>_high`.
+
+    Joint errors in data units are well-defined only where all outputs share a unit; else theirs is `mixed`, and
+    `nrmse`, in units of the simulator's own spread, is the one to read:
+
+        nrmse_i = rmse_i / s_i,     nrmse_joint = sqrt(1/dy sum_i nrmse_i^2)
+
+    Args:
+        result: of `one_step`.
+        blocks: of the bootstrap.
+        encoding: names and units.
+        target_std: s, standard deviation of the targets over the simulator's ranges, in data units, shape (dy,).
+    """
+    names, units = [*encoding.y_names, "joint"], [*encoding.y_units, joint_unit(encoding)]
     rows: list[dict[str, object]] = []
     for metric, (field, statistic) in STATISTICS.items():
         points = getattr(result, field)
         for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-            shown = unit if metric in ("rmse", "mae", "crps") else "nat" if metric == "nll" else "1"
-            estimate = bootstrap(points[:, i], blocks, statistic)
-            rows += interval_rows(metric, name, shown, estimate)
+            shown = unit if metric in IN_DATA_UNITS else "nat" if metric == "nll" else "1"
+            rows += interval_rows(metric, name, shown, bootstrap(points[:, i], blocks, statistic))
+    relative = result.squared[:, :-1] / target_std**2
+    for i, name in enumerate(names):
+        points = relative[:, i] if name != "joint" else relative.mean(axis=1)
+        rows += interval_rows("nrmse", name, "1", bootstrap(points, blocks, np.sqrt))
     return rows
+
+
+def joint_unit(encoding: Encoding) -> str:
+    """Return the unit that all outputs share, else `mixed`."""
+    units = set(encoding.y_units)
+    return units.pop() if len(units) == 1 else MIXED
