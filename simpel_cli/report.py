@@ -49,6 +49,11 @@ FIGURES = {
         "The model runs on its own predictions along the measured inputs. The claimed standard deviation is that "
         "between the particles, plus the noise of one measurement. An error well above it asks for a better simulator.",
     ),
+    "free_run_example": (
+        "One free run",
+        "The one whose error is the median of all free runs of the first seed. The band is two claimed standard deviations "
+        "to either side: the model's own uncertainty, grown along the way, and the noise of one measurement.",
+    ),
 }
 
 

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -53,12 +54,18 @@ class TestFit:
         names = {str(p.relative_to(fitted)) for p in fitted.rglob("*") if p.is_file()}
         expected = {
             "manifest.json", "config.yaml", "metrics.parquet", "predictions.parquet", "calibration.parquet",
-            "horizon.parquet", "checkpoint/state.safetensors", "run.log", "report.html", ".hydra/config.yaml",
-            ".hydra/overrides.yaml", ".hydra/hydra.yaml",
+            "horizon.parquet", "trajectories.parquet", "checkpoint/state.safetensors", "run.log", "report.html",
+            ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml",
         }  # fmt: skip
         assert expected <= names
         figures = {n for n in names if n.endswith(".png")}
-        assert {"learning_curves.png", "predictions.png", "calibration.png", "free_run.png"} <= figures
+        assert {
+            "learning_curves.png",
+            "predictions.png",
+            "calibration.png",
+            "free_run.png",
+            "free_run_example.png",
+        } <= figures
         assert names == expected | figures  # and nothing temporary
 
     def test_manifest(self, fitted: Path) -> None:
@@ -109,6 +116,21 @@ class TestFit:
             if row["output"] == "omega":
                 now, then = (speed[row["episode"], round(row["time"] + dt, 6)] for dt in (0.0, 0.05))
                 assert row["measured"] == pytest.approx(then - now, abs=1e-9)
+
+    def test_free_runs_along_the_measurements(self, fitted: Path) -> None:
+        found = pq.read_table(fitted / "trajectories.parquet").to_pylist()
+        data = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pylist()
+        speed = {(str(row["episode"]), round(row["t"], 6)): row["omega"] for row in data}
+        assert {(row["output"], row["unit"]) for row in found} == {("phi", "rad"), ("omega", "rad/s")}
+        for row in found:
+            assert -1e-9 < row["time"] - row["start"] < 0.5 + 1e-9
+            assert row["std"] > 0
+            if row["output"] == "omega":
+                assert row["measured"] == pytest.approx(speed[row["episode"], round(row["time"], 6)], abs=1e-9)
+            else:
+                assert abs(row["mean"] - row["measured"]) < np.pi  # on the same turn
+            if row["time"] == row["start"]:
+                assert row["mean"] == pytest.approx(row["measured"], abs=1e-6)
 
     def test_a_joint_error_of_mixed_units_is_kept_but_not_shown(self, fitted: Path) -> None:
         joint = {row["metric"]: row for row in rows(fitted, split="test") if row["output"] == "joint"}

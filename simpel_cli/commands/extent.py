@@ -36,9 +36,8 @@ def _stand_alone(recording: Recording) -> bool:
 
 def _episodes(recording: Recording, part: Sequence[Episode]) -> list[str]:
     """The user's episodes in a part."""
-    every = (*recording.train, *recording.test)
-    name_of = {e.name: episode for e, (episode, _) in zip(every, origins(every), strict=True)}
-    return list(dict.fromkeys(name_of[e.name] for e in part))
+    of = origins((*recording.train, *recording.test))
+    return list(dict.fromkeys(of[e.name][0] for e in part))
 
 
 def _rows(part: Sequence[Episode]) -> int:

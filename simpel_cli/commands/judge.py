@@ -1,5 +1,6 @@
 """Judge posteriors on held-out episodes and write what people look at: Parquet, figures, report."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -7,9 +8,11 @@ import numpy as np
 
 from simpel_cli import evaluation as ev
 from simpel_cli.commands.study import Study
-from simpel_cli.data import Places, Transitions, origins, places, transitions
+from simpel_cli.data import Episode, Places, origins, places, transitions
 from simpel_cli.encoding import Encoding
 from simpel_cli.records import write_table
+
+MOST_RUNS = 100  # free runs whose course is kept
 
 
 class Judged(NamedTuple):
@@ -23,7 +26,7 @@ class Judged(NamedTuple):
 def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, directory: Path, step: int) -> Judged:
     """Evaluate the posterior of every seed on the test split.
 
-    Writes `predictions.parquet`, `calibration.parquet` and `horizon.parquet` into `directory`.
+    Writes `predictions.parquet`, `calibration.parquet`, `horizon.parquet` and `trajectories.parquet` into `directory`.
 
     Args:
         study: what was fitted, with the measurements to judge it on.
@@ -37,12 +40,17 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     episodes = study.recording.test
     pairs = transitions(episodes, encoding.stack)
     x, y = ev.test_arrays(pairs, encoding)
-    where = _places(study, pairs)
+    where = _places(study, episodes, pairs.episode, pairs.row)
     blocks = ev.blocks_of(pairs.episode, pairs.row, horizon)
     follow = tuple(e for e in episodes if e.next_states is None)
     # the longest roll-out that an episode has room for
     horizon = min(horizon, max((len(e.states) - 1 - encoding.stack for e in follow), default=0))
-    tables: dict[str, list[dict[str, np.ndarray]]] = {"predictions": [], "calibration": [], "horizon": []}
+    tables: dict[str, list[dict[str, np.ndarray]]] = {
+        "predictions": [],
+        "calibration": [],
+        "horizon": [],
+        "trajectories": [],
+    }
     rows: list[dict[str, Any]] = []
     run = None
     for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
@@ -54,6 +62,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
         if run is not None:
             found += ev.free_run_table(run, encoding, dt)
             tables["horizon"].append(_horizon(seed, run, encoding, dt))
+            tables["trajectories"].append(_trajectories(seed, run, study, follow))
         rows += [{"seed": seed, "step": step, "split": "test", **row} for row in found]
     for name, parts in tables.items():
         if parts:
@@ -61,10 +70,10 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     return Judged(rows, blocks.kind, horizon * dt if run is not None else None)
 
 
-def _places(study: Study, pairs: Transitions) -> Places:
-    """Where the test transitions begin."""
-    train, test = study.recording.train, study.recording.test
-    return places(test, origins((*train, *test))[len(train) :], pairs.episode, pairs.row)
+def _places(study: Study, episodes: Sequence[Episode], index: np.ndarray, row: np.ndarray) -> Places:
+    """Where rows of test episodes come from."""
+    of = origins((*study.recording.train, *study.recording.test))
+    return places(episodes, of, index, row)
 
 
 def _predictions(
@@ -116,4 +125,28 @@ def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, 
         "unit": np.tile([q.unit for q in encoding.states], steps),
         "rmse": rmse.ravel(),
         "claimed_std": claimed.ravel(),
+    }
+
+
+def _trajectories(seed: int, run: ev.FreeRun, study: Study, episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+    """Measured and predicted course of free runs, at most `MOST_RUNS` of them, spread evenly over the test data.
+
+    An angle's prediction is written on the turn of the measured one.
+    """
+    count, length, ds = run.error.shape
+    kept = np.unique(np.linspace(0, count - 1, min(count, MOST_RUNS)).astype(int))
+    rows = run.row[kept, None] + np.arange(length)
+    where = _places(study, episodes, np.repeat(run.episode[kept], length), rows.ravel())
+    states, n = study.system.encoding.states, len(kept) * length
+    return {
+        "seed": np.full(n * ds, seed),
+        "episode": np.repeat(where.episode, ds),
+        "segment": np.repeat(where.segment, ds),
+        "start": np.repeat(where.time.reshape(-1, length)[:, 0], length * ds),
+        "time": np.repeat(where.time, ds),
+        "output": np.tile([q.name for q in states], n),
+        "unit": np.tile([q.unit for q in states], n),
+        "measured": run.measured[kept].ravel(),
+        "mean": (run.measured + run.error)[kept].ravel(),
+        "std": run.std[kept].ravel(),
     }

@@ -1,6 +1,6 @@
 """Where rows come from: the user's own episode, the segment of it that checks or splits cut, and the time."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,8 @@ class Places(NamedTuple):
     time: np.ndarray  # (n,) s, as measured
 
 
-def origins(episodes: Sequence[Episode]) -> list[tuple[str, int]]:
-    """Return the user's episode and the segment of it, from 1, for every `Episode`.
+def origins(episodes: Sequence[Episode]) -> dict[str, tuple[str, int]]:
+    """Return the user's episode and the segment of it, from 1, by the name of every `Episode`.
 
     Reading calls the second segment of episode 3 `3/2`. A user's own name may look the same: `day/2` is taken for a
     segment only if there is an episode `day`, or neither `day/0` nor `day/1` (the first segment may be too short to
@@ -28,7 +28,7 @@ def origins(episodes: Sequence[Episode]) -> list[tuple[str, int]]:
         episodes: all of a recording, or the answer may miss the ones that tell.
     """
     names = {episode.name for episode in episodes}
-    return [_origin(episode, names) for episode in episodes]
+    return {episode.name: _origin(episode, names) for episode in episodes}
 
 
 def _origin(episode: Episode, names: set[str]) -> tuple[str, int]:
@@ -40,20 +40,22 @@ def _origin(episode: Episode, names: set[str]) -> tuple[str, int]:
     return episode.name, 1
 
 
-def places(episodes: Sequence[Episode], of: Sequence[tuple[str, int]], index: np.ndarray, row: np.ndarray) -> Places:
+def places(
+    episodes: Sequence[Episode], of: Mapping[str, tuple[str, int]], index: np.ndarray, row: np.ndarray
+) -> Places:
     """Return the origin of rows.
 
     Args:
         episodes: what the rows are of.
-        of: their origins.
+        of: origins of them and perhaps of others.
         index: of the episode, (n,).
         row: in the episode, (n,).
     """
     first = np.concatenate([[0], np.cumsum([len(episode.time) for episode in episodes])])
     time = np.concatenate([episode.time for episode in episodes])
     return Places(
-        episode=np.array([name for name, _ in of])[index],
-        segment=np.array([segment for _, segment in of])[index],
+        episode=np.array([of[episode.name][0] for episode in episodes])[index],
+        segment=np.array([of[episode.name][1] for episode in episodes])[index],
         row=row,
         time=time[first[index] + row],
     )

@@ -13,16 +13,30 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BLACK = "#000000"
 DASHES = ("-", "--", ":", "-.")
 MARKERS = ("", "o", "s", "^")
+LEGEND_LINES = 14  # in a column of a legend
+LEGEND_WIDTH = 1.5  # of that column, inches
 
 
-def new_figure(n: int, width: float = 3.6, height: float = 2.8, columns: int = 4) -> tuple[Any, list[Any]]:
-    """Rows of n axes, without pyplot: no global state, no display."""
+def new_figure(
+    n: int, width: float = 3.6, height: float = 2.8, columns: int = 4, beside: int = 0
+) -> tuple[Any, list[Any]]:
+    """Rows of n axes, without pyplot: no global state, no display.
+
+    Args:
+        n: number of axes.
+        width: of one, inches.
+        height: of one, inches.
+        columns: most in a row.
+        beside: number of lines in a legend beside the last one, for which the figure grows.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(n, columns)
     rows = -(-n // columns)
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    figure = Figure(
+        figsize=(width * columns + LEGEND_WIDTH * -(-beside // LEGEND_LINES), height * rows), layout="constrained"
+    )
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     for unused in axes[n:]:
@@ -34,8 +48,8 @@ def new_figure(n: int, width: float = 3.6, height: float = 2.8, columns: int = 4
 
 
 def line_style(i: int) -> dict[str, Any]:
-    """Colour, dashes and marker of the i-th line: no two of the first 96 look the same."""
-    dash, marker = divmod(i // len(COLOURS), len(DASHES))[::-1]
+    """Colour and dashes of the i-th line: no two of the first 24 look the same, and later ones differ by a marker."""
+    dash, marker = (i // len(COLOURS)) % len(DASHES), i // (len(COLOURS) * len(DASHES))
     return {
         "color": COLOURS[i % len(COLOURS)],
         "linestyle": DASHES[dash],
@@ -45,19 +59,18 @@ def line_style(i: int) -> dict[str, Any]:
     }
 
 
-def legend_below(figure: Any, axis: Any, columns: int = 4) -> None:
+def legend_below(figure: Any, axis: Any) -> None:
     """Put the legend of an axis below the whole figure, where it covers no curve."""
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=min(len(labels), columns), fontsize=8, frameon=False
-    )
+    columns = max(1, int(figure.get_figwidth() // 1.7))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
 
 
 def legend_beside(axis: Any) -> None:
     """Put the legend of an axis to its right, in as many columns as its lines need."""
-    n = len(axis.get_legend_handles_labels()[1])
+    columns = -(-len(axis.get_legend_handles_labels()[1]) // LEGEND_LINES)
     axis.legend(
-        loc="center left", bbox_to_anchor=(1.01, 0.5), ncols=-(-n // 14), fontsize=7, frameon=False, borderaxespad=0
+        loc="center left", bbox_to_anchor=(1.01, 0.5), ncols=columns, fontsize=7, frameon=False, borderaxespad=0
     )
 
 

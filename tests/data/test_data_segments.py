@@ -26,12 +26,12 @@ def named(*names: str) -> list[Episode]:
     ],
 )
 def test_origins(names: list[str], expected: list[tuple[str, int]]) -> None:
-    assert origins(named(*names)) == expected
+    assert list(origins(named(*names)).items()) == list(zip(names, expected, strict=True))
 
 
 def test_rows_that_are_transitions_are_never_segments() -> None:
     pairs = [episode._replace(next_states=episode.states) for episode in named("a", "a/2")]
-    assert origins(pairs) == [("a", 1), ("a/2", 1)]
+    assert origins(pairs) == {"a": ("a", 1), "a/2": ("a/2", 1)}
 
 
 def test_places_of_a_cut_recording(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_places_of_a_cut_recording(tmp_path: Path) -> None:
     split = {"test_fraction": 0.5, "by": "time"}
     recording = read(Measurements("d.csv", time="t", episode="run", split=split), DECAY, tmp_path, 0)
     pairs = transitions(recording.test, 0)
-    of = origins((*recording.train, *recording.test))[len(recording.train) :]
+    of = origins((*recording.train, *recording.test))
     where = places(recording.test, of, pairs.episode, pairs.row)
     assert list(dict.fromkeys(zip(where.episode, where.segment, strict=True))) == [("up", 3), ("down", 2)]
     at = {(run, float(x)): t for run, t, x in rows}
