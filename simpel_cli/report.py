@@ -24,7 +24,8 @@ pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color
 <h1>{{ title }}</h1><p class="lead">{{ lead }}</p>
 {% for table in tables %}<h2>{{ table.title }}</h2>
 {% if table.note %}<p>{{ table.note }}</p>{% endif %}
-<div class="scroll"><table><thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead><tbody>
+<div class="scroll"><table>
+{% if table.head %}<thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>
 {% for row in table.rows %}<tr>{% for cell in row %}<td{% if table.text %} class="text">{{ cell }}{% else %}>
 {% set parts = cell.split(" (") %}{{ parts[0] }}{% if parts[1] %}<br><span class="interval">({{ parts[1] }}</span>{% endif %}
 {% endif %}</td>{% endfor %}

@@ -163,6 +163,32 @@ class TestFit:
         assert "<script" not in page
         assert "simpel evaluate" in page
 
+    def test_report_says_how_the_result_came_about(self, fitted: Path) -> None:
+        record = json.loads((fitted / "manifest.json").read_text())
+        page = (fitted / "report.html").read_text()
+        table = page[page.index("<h2>Run</h2>") : page.index("<h2>Data checks</h2>")]
+        cells = re.findall(r"<td[^>]*>(.*?)</td>", table)
+        run_table = dict(zip(cells[::2], cells[1::2], strict=True))
+        assert run_table["training"] == "20 of 531 transitions"
+        assert run_table["seeds"] == "0"
+        said = re.search(r"kappa ([\d.e -]+)", (fitted / "run.log").read_text())
+        kappa = re.findall(r"(?:sin\(phi\)|cos\(phi\)|omega) ([\d.e-]+)", run_table["gap scale kappa"])
+        assert said is not None
+        assert [f"{float(k):.2g}" for k in kappa] == said[1].split()
+        # a free run starts from a measured state: no spread there but that of the noise
+        start = next(
+            row for row in pq.read_table(fitted / "trajectories.parquet").to_pylist()
+            if row["output"] == "omega" and row["time"] == row["start"]
+        )  # fmt: skip
+        assert f"omega {start['std']:.3g} rad/s" in run_table["learned noise"]
+        assert run_table["device"] == f"{record['device']}, float32"
+        assert f"training {record['train_seconds']:.1f} s" in run_table["time"]
+        seconds = re.search(r"([\d.]+) s in all", run_table["time"])
+        assert seconds is not None
+        assert record["train_seconds"] < float(seconds[1]) <= record["wall_seconds"] + 0.05
+        for name in ("simpel", "jax", "numpy"):
+            assert f"{name} {record['versions'][name]}" in run_table["software"]
+
     def test_same_seed_same_numbers(self, fitted: Path, tmp_path: Path) -> None:
         run(tmp_path, *FIT, "hydra.run.dir=again", "evaluation.horizon=0.5")
         assert rows(tmp_path / "again") == rows(fitted)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from simpel_cli.commands.fit import checkpointed_state, refuse_changed_inputs
 from simpel_cli.commands.judge import judge
+from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import publish
 from simpel_cli.commands.study import open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
@@ -59,4 +60,5 @@ def evaluate(job: Job) -> None:
         judged = judge(judged_on, posteriors(study, fitted, state), fitted.target_std, directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
         write_metrics(directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])})
-        publish(terminal, judged_on, judged, directory, dump(config), "evaluate", run)
+        table = run_table(study, fitted, judged, manifest)
+        publish(terminal, judged_on, judged, directory, dump(config), "evaluate", table, run)

@@ -21,6 +21,7 @@ class Judged(NamedTuple):
     rows: list[dict[str, Any]]  # metric rows of all seeds
     blocks: str
     horizon: float | None  # s, of the free runs; None: no episode is long enough
+    noise_std: np.ndarray  # learned, per seed and target, (seeds, dy), data units
 
 
 def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, directory: Path, step: int) -> Judged:
@@ -67,7 +68,8 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     for name, parts in tables.items():
         if parts:
             write_table(directory / f"{name}.parquet", {k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
-    return Judged(rows, blocks.kind, horizon * dt if run is not None else None)
+    noise_std = np.stack([ev.noise_of(posterior, encoding) for posterior in posteriors])
+    return Judged(rows, blocks.kind, horizon * dt if run is not None else None, noise_std)
 
 
 def _places(study: Study, episodes: Sequence[Episode], index: np.ndarray, row: np.ndarray) -> Places:

@@ -77,9 +77,21 @@ def publish(
     directory: Path,
     config: str,
     command: str,
+    run: dict[str, Any],
     source: Path | None = None,
 ) -> None:
-    """Print the test results, draw the figures, write the report, and say where things lie and what to type next."""
+    """Print the test results, draw the figures, write the report, and say where things lie and what to type next.
+
+    Args:
+        terminal: to print to.
+        study: what was judged, on its measurements.
+        judged: the results.
+        directory: of the run.
+        config: the resolved configuration, as text.
+        command: verb.
+        run: table of how the results came about.
+        source: directory of the fit that was evaluated.
+    """
     values = _by_metric(judged.rows)
     extent = extent_of_test(study.recording)
     terminal.line()
@@ -109,7 +121,7 @@ def publish(
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
         lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
-        tables=[*tables, checks],
+        tables=[*tables, run, checks],
         figures=figures,
         commands=next_commands,
         config=config,

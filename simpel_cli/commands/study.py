@@ -126,6 +126,7 @@ class Fitted(NamedTuple):
     bind: Callable[[Problem], Inference]
     keys: Key[Array, " seeds"]
     training: list[tuple[np.ndarray, np.ndarray]]
+    available: int  # training transitions that `data.n_train` chose from
     normaliser: Normaliser
 
     @property
@@ -160,7 +161,7 @@ def prepare(study: Study) -> Fitted:
         precision=settings.precision,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
-    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, normaliser)
+    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
 
 
 def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:

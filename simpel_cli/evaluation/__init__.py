@@ -12,10 +12,10 @@ from simpel_cli.evaluation.one_step import (
     one_step,
     one_step_table,
 )
-from simpel_cli.evaluation.posterior import CHUNK, Posterior, test_arrays
+from simpel_cli.evaluation.posterior import CHUNK, Posterior, noise_of, test_arrays
 
 __all__ = [
     "CHUNK", "IN_DATA_UNITS", "LEVELS", "MIXED", "Blocks", "Estimate", "FreeRun", "OneStep", "Posterior", "blocks_of",
-    "bootstrap", "chi_squared_quantile", "free_run", "free_run_table", "joint_unit", "one_step", "one_step_table",
-    "test_arrays", "windows",
+    "bootstrap", "chi_squared_quantile", "free_run", "free_run_table", "joint_unit", "noise_of", "one_step",
+    "one_step_table", "test_arrays", "windows",
 ]  # fmt: skip

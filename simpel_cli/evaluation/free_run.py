@@ -7,7 +7,7 @@ import numpy as np
 from simpel_cli.data.recording import Episode
 from simpel_cli.encoding import Encoding
 from simpel_cli.evaluation.bootstrap import blocks_of, bootstrap, interval_rows
-from simpel_cli.evaluation.posterior import CHUNK, Posterior
+from simpel_cli.evaluation.posterior import Posterior, noise_of
 from simpel_cli.inference import padded_length
 
 
@@ -76,7 +76,7 @@ def rollout(
         States of every particle (H + 1, L, W, ds), physical units, and the noise per state (ds,).
     """
     w = len(states)
-    noise = np.asarray(posterior.predict(np.zeros((CHUNK, encoding.dim_x))).noise_std, dtype=float)
+    noise = noise_of(posterior, encoding)
     encoded = np.broadcast_to(encoding.encode(states)[None], (posterior.particles, w, encoding.dim_state))
     path = [encoded]
     for h in range(inputs.shape[1]):

@@ -27,6 +27,11 @@ class Posterior(NamedTuple):
     particles: int
 
 
+def noise_of(posterior: Posterior, encoding: Encoding) -> np.ndarray:
+    """Return the learned standard deviation of the noise per target, data units, shape (dy,)."""
+    return np.asarray(posterior.predict(np.zeros((CHUNK, encoding.dim_x))).noise_std, dtype=float)
+
+
 def test_arrays(transitions: Transitions, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:
     """Return network inputs (n, dx) and targets (n, dy) of measured transitions, data units."""
     x = encoding.to_x(transitions.states, transitions.inputs)
