@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from command_line import ROOT, TINY, environment, process, rig, simpel, start
+from command_line import ROOT, TINY, csv, environment, process, rig, simpel, start, swing
 from safetensors.numpy import load_file
 
 from simpel_cli.run import sha256
@@ -215,6 +215,19 @@ class TestFit:
         arrays = load_file(tmp_path / "run" / "checkpoint" / "state.safetensors")
         assert all(a.dtype == "float64" or a.dtype.kind == "i" for a in arrays.values())
 
+    def test_segments_of_an_episode_are_not_taken_for_episodes(self, tmp_path: Path) -> None:
+        """Every sixth row is lost, so that each of four episodes falls into twelve pieces."""
+        rig(tmp_path, measurements=csv([r for i, r in enumerate(swing(episodes=4, rows=72)) if i % 6 != 5]))
+        run(tmp_path, "fit", "--config-dir", "my", "sim=cart", "data=rig", *TINY, "hydra.run.dir=run")
+        said = (tmp_path / "run" / "run.log").read_text()
+        assert "3 train / 1 test episodes in 36 / 12 segments," in said
+        assert "test (1 episode in 12 segments)" in said
+        assert "resampling 4 windows of 1 s)" in said
+        found = pq.read_table(tmp_path / "run" / "predictions.parquet").to_pylist()
+        assert len({row["episode"] for row in found}) == 1
+        assert {row["segment"] for row in found} == set(range(1, 13))
+        assert all(row["time"] == pytest.approx(0.05 * (6 * (row["segment"] - 1) + row["row"])) for row in found)
+
 
 class TestEvaluate:
     def test_repeats_the_judgement_of_the_fit(self, fitted: Path) -> None:
@@ -291,6 +304,7 @@ class TestSimulate:
         said = (tmp_path / "f" / "run.log").read_text()
         assert "30 train / 10 test rows, 30 rows used " in said
         assert "test (10 rows)" in said
+        assert "resampling 10 rows)" in said
         assert re.search(r"  value +NLL", said)
         assert "one step" not in said.lower()
         assert "one step" not in (tmp_path / "f" / "report.html").read_text().split("<h2>Go on")[0].lower()

@@ -61,7 +61,7 @@ def data() -> tuple[np.ndarray, np.ndarray]:
 def rows_of(
     posterior: Posterior, data: tuple[np.ndarray, np.ndarray], encoding: Encoding = ENCODING
 ) -> list[dict[str, object]]:
-    blocks = blocks_of(np.arange(N) // 10, np.zeros(N, int), 1)
+    blocks = blocks_of(np.arange(N) // 10, np.zeros(N), 1, "s")
     return one_step_table(one_step(posterior, *data), blocks, encoding, SPREAD)
 
 
@@ -141,7 +141,7 @@ def test_intervals_cover_the_mean_of_correlated_points_as_often_as_they_say() ->
     n_blocks, length, repeats = 40, 10, 300
     episode = np.repeat(np.arange(n_blocks), length)
     row = np.tile(np.arange(length), n_blocks)
-    by_block = blocks_of(episode, row, length)
+    by_block = blocks_of(episode, row, length, "rows")
     by_point = Blocks(np.arange(len(row)), "points")
     rng = np.random.default_rng(0)
     hits = np.zeros(2)
@@ -172,11 +172,19 @@ def test_statistic_is_of_the_mean() -> None:
 
 def test_blocks() -> None:
     row = np.tile(np.arange(25), 2)
-    few = blocks_of(np.repeat([3, 8], 25), row, 10)
+    few = blocks_of(np.repeat(["c", "a"], 25), row, 10, "rows")
     np.testing.assert_array_equal(np.bincount(few.of_point), [10, 10, 5] * 2)
-    assert few.kind == "blocks of 10 rows"
-    many = blocks_of(np.repeat(np.arange(12), 5), np.tile(np.arange(5), 12), 2)
-    assert (many.kind, len(np.unique(many.of_point))) == ("episodes", 12)
+    assert (few.kind, str(few)) == ("windows of 10 rows", "6 windows of 10 rows")
+    many = blocks_of(np.repeat(np.arange(12), 5), np.tile(np.arange(5), 12), 2, "rows")
+    assert (many.kind, str(many)) == ("episodes", "12 episodes")
+
+
+def test_windows_of_time_start_with_the_episode_and_do_not_see_rounding() -> None:
+    time = np.concatenate([7.3 + 0.1 * np.arange(40), 100.05 + 0.1 * np.arange(20)])
+    blocks = blocks_of(np.repeat(["a", "b"], [40, 20]), time, 1.0, "s")
+    np.testing.assert_array_equal(np.bincount(blocks.of_point), [10] * 6)
+    assert blocks.kind == "windows of 1 s"
+    assert "nothing" in str(blocks_of(np.repeat("a", 40), time[:40], 10.0, "s"))
 
 
 # Free runs
@@ -184,6 +192,7 @@ def test_blocks() -> None:
 
 PENDULUM = model("pendulum", m=0.8, l=1.2, C_m=1.0)
 HORIZON = 40
+ALONE = Blocks(np.arange(6), "runs")
 
 
 def episodes(stack: int, count: int = 2, length: int = 100) -> tuple[Episode, ...]:
@@ -233,7 +242,7 @@ def test_free_run_of_the_truth_has_no_error() -> None:
     # without spread, the noise is left; the variance of the angle is the sum of those of its pair
     np.testing.assert_allclose(run.std[..., 0], 0.005, rtol=1e-6)
     np.testing.assert_allclose(run.std[..., 1], 0.05, rtol=1e-6)
-    rows = {(r["metric"], r["output"]): r["value"] for r in free_run_table(run, encoding, 0.05)}
+    rows = {(r["metric"], r["output"]): r["value"] for r in free_run_table(run, ALONE, encoding, 0.05)}
     assert rows["free_run_rmse@2s", "phi"] == pytest.approx(0, abs=1e-9)
     assert {m for m, _ in rows} >= {"free_run_rmse@0.5s", "free_run_rmse@1s", "free_run_rmse@2s_high"}
 

@@ -42,7 +42,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     pairs = transitions(episodes, encoding.stack)
     x, y = ev.test_arrays(pairs, encoding)
     where = _places(study, episodes, pairs.episode, pairs.row)
-    blocks = ev.blocks_of(pairs.episode, pairs.row, horizon)
+    blocks = _blocks(study, episodes, where, horizon)
     follow = tuple(e for e in episodes if e.next_states is None)
     # the longest roll-out that an episode has room for
     horizon = min(horizon, max((len(e.states) - 1 - encoding.stack for e in follow), default=0))
@@ -61,7 +61,8 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
         tables["calibration"].append(_calibration(seed, result, encoding))
         run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None
         if run is not None:
-            found += ev.free_run_table(run, encoding, dt)
+            starts = _places(study, follow, run.episode, run.row)
+            found += ev.free_run_table(run, _blocks(study, follow, starts, horizon), encoding, dt)
             tables["horizon"].append(_horizon(seed, run, encoding, dt))
             tables["trajectories"].append(_trajectories(seed, run, study, follow))
         rows += [{"seed": seed, "step": step, "split": "test", **row} for row in found]
@@ -69,13 +70,23 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
         if parts:
             write_table(directory / f"{name}.parquet", {k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     noise_std = np.stack([ev.noise_of(posterior, encoding) for posterior in posteriors])
-    return Judged(rows, blocks.kind, horizon * dt if run is not None else None, noise_std)
+    return Judged(rows, str(blocks), horizon * dt if run is not None else None, noise_std)
 
 
 def _places(study: Study, episodes: Sequence[Episode], index: np.ndarray, row: np.ndarray) -> Places:
     """Where rows of test episodes come from."""
     of = origins((*study.recording.train, *study.recording.test))
     return places(episodes, of, index, row)
+
+
+def _blocks(study: Study, episodes: Sequence[Episode], where: Places, horizon: int) -> ev.Blocks:
+    """What the bootstrap resamples: single rows where they stand alone, else episodes, or windows of the horizon."""
+    encoding, dt = study.system.encoding, study.system.source.dt
+    if not encoding.states and not encoding.stack and len(set(where.episode)) < ev.MIN_EPISODES:
+        return ev.Blocks(np.arange(len(where.row)), "rows")
+    if any(episode.next_states is not None for episode in episodes):
+        return ev.blocks_of(where.episode, where.row, horizon, "rows")  # their time may be unknown
+    return ev.blocks_of(where.episode, where.time, horizon * dt, "s")
 
 
 def _predictions(

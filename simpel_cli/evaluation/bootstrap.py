@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+MIN_EPISODES = 10  # fewer say too little of the spread between episodes
+
 
 class Blocks(NamedTuple):
     """Resampling units: whole episodes where there are enough, else contiguous pieces of them."""
@@ -12,21 +14,34 @@ class Blocks(NamedTuple):
     of_point: np.ndarray  # (n,) block of every point
     kind: str
 
+    def __str__(self) -> str:
+        count = len(np.unique(self.of_point))
+        return f"{count} {self.kind}" if count > 1 else f"nothing: one of the {self.kind} holds all points"
 
-def blocks_of(episode: np.ndarray, row: np.ndarray, length: int) -> Blocks:
+
+def blocks_of(episode: np.ndarray, at: np.ndarray, length: float | int, unit: str) -> Blocks:
     """Assign points to blocks for the bootstrap.
 
+    Segments of an episode are not independent of each other: what counts is the episode that they were cut from.
+
     Args:
-        episode: episode index per point, shape (n,).
-        row: row in the episode per point, shape (n,).
-        length: rows per block where there are fewer than 10 episodes.
+        episode: the user's episode of every point, shape (n,).
+        at: where in the episode, in `unit`, shape (n,).
+        length: of a block in `unit`, where there are fewer than `MIN_EPISODES` episodes.
+        unit: `s` or `rows`.
 
     Reference: Kuensch (1989), The jackknife and the bootstrap for general stationary observations.
     """
-    if len(np.unique(episode)) >= 10:
-        return Blocks(np.unique(episode, return_inverse=True)[1], "episodes")
-    pairs = np.stack([episode, row // max(length, 1)], axis=1)
-    return Blocks(np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1), f"blocks of {length} rows")
+    names, code = np.unique(episode, return_inverse=True)
+    if len(names) >= MIN_EPISODES:
+        return Blocks(code, "episodes")
+    first = np.full(len(names), np.inf)
+    np.minimum.at(first, code, at)
+    # a time that falls on an edge must not come to lie on either side of it by rounding
+    window = np.floor((at - first[code]) / length + 1e-6).astype(int)
+    pairs = np.stack([code, window], axis=1)
+    blocks = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
+    return Blocks(blocks, f"windows of {length:g} {unit}")
 
 
 class Estimate(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Episode
 from simpel_cli.encoding import Encoding
-from simpel_cli.evaluation.bootstrap import blocks_of, bootstrap, interval_rows
+from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import Posterior, noise_of
 from simpel_cli.inference import padded_length
 
@@ -110,10 +110,9 @@ def _stacked(inputs: np.ndarray, start: int, horizon: int, k: int) -> np.ndarray
     return np.concatenate([inputs[start - k + j : start - k + j + horizon] for j in range(k + 1)], axis=1)
 
 
-def free_run_table(run: FreeRun, encoding: Encoding, dt: float) -> list[dict[str, object]]:
+def free_run_table(run: FreeRun, blocks: Blocks, encoding: Encoding, dt: float) -> list[dict[str, object]]:
     """Return metric rows `free_run_rmse@<horizon>s` per state at a quarter, half and the whole of the horizon."""
     horizon = run.error.shape[1] - 1
-    blocks = blocks_of(run.episode, run.row, horizon)
     rows: list[dict[str, object]] = []
     for h in sorted({max(1, horizon // 4), max(1, horizon // 2), horizon}):
         for i, q in enumerate(encoding.states):
