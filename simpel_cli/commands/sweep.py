@@ -139,10 +139,9 @@ def _collect(outcomes: list[Outcome], terminal: Terminal) -> None:
     path = write_metrics(root / "sweep.parquet", rows, {})
     terminal.line()
     terminal.line(str(path), "results")
-    for metric in ("nll", "rmse"):
-        figure = draw_sweep(path, metric)
-        if figure is not None:
-            terminal.line(str(figure), "figure")
+    figure = draw_sweep(path)
+    if figure is not None:
+        terminal.line(str(figure), "figure")
 
 
 def _result(directory: Path) -> str:
