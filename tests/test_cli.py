@@ -266,6 +266,30 @@ class TestEvaluate:
         assert nll[0] != nll[1]
         record = json.loads((tmp_path / "e" / "manifest.json").read_text())
         assert any("made" in path for path in record["inputs_sha256"])
+        judged = pq.read_table(tmp_path / "e" / "predictions.parquet").to_pylist()
+        assert len(judged) == 4 * 29 * 3  # every transition of every episode, whatever the file calls train or test
+        assert {row["episode"] for row in judged} == {"0", "1", "2", "3"}
+        said = (tmp_path / "e" / "run.log").read_text()
+        assert re.search(r"measurements.parquet   all of it, 4 episodes, new to the fit   checks \d+ ok", said)
+        assert "test (4 episodes)" in said
+        assert "the fit was not trained on this file" in (tmp_path / "e" / "report.html").read_text()
+
+    def test_one_new_episode(self, fitted: Path, tmp_path: Path) -> None:
+        table = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pandas()
+        (tmp_path / "my" / "data").mkdir(parents=True)
+        table[table["episode"] == 0].drop(columns=["episode", "split"]).to_csv(tmp_path / "my" / "run.csv")
+        (tmp_path / "my" / "data" / "one.yaml").write_text("path: ../run.csv\ntime: t\n")
+        run(tmp_path, "evaluate", fitted, "--config-dir", "my", "data=one", "hydra.run.dir=e", "run.quiet=true")
+        judged = pq.read_table(tmp_path / "e" / "predictions.parquet")
+        assert judged.num_rows == (len(table) // 12 - 2) * 3  # the one step across the cut is lost
+        assert "all of it, 1 episode in 2 segments, new to the fit" in (tmp_path / "e" / "run.log").read_text()
+
+    def test_the_files_own_training_data_are_not_judged(self, fitted: Path, tmp_path: Path) -> None:
+        words = ("data=pendulum", "data.split={test_fraction:0.9,by:episode}", "run.quiet=true")
+        run(tmp_path, "evaluate", fitted, *words, "hydra.run.dir=e")
+        assert rows(tmp_path / "e", "command") == rows(fitted, "command", split="test")
+        said = (tmp_path / "e" / "run.log").read_text()
+        assert "measurements.parquet   the test split of the fit, 3 episodes   checks" in said
 
 
 class TestSimulate:

@@ -9,6 +9,7 @@ from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
+from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.plots import draw_run
 from simpel_cli.report import write_report
@@ -38,19 +39,24 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
         f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}",
         style="bold",
     )
+    describe_data(terminal, recording, f"{extent_of_split(recording)}, {_used(study, fitted)}")
+    uncertain = " ".join(q.name for q in source.params) or "nothing"
+    kind = "" if study.system.transition is not None else " (queried)"
+    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+
+
+def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
+    """Say which file was read, what of it is used, and what to look at."""
     failed = [c for c in recording.checks if not c.ok]
     terminal.line(
-        f"{recording.files[0]}   {extent_of_split(recording)}, {_used(study, fitted)}   "
-        f"checks {len(recording.checks) - len(failed)} ok" + (f", {len(failed)} to look at" if failed else ""),
+        f"{recording.files[0]}   {used}   checks {len(recording.checks) - len(failed)} ok"
+        + (f", {len(failed)} to look at" if failed else ""),
         "data",
     )
     for check in failed:
         terminal.line(f"{check.name}: {check.detail}", "", style="yellow")
     if recording.estimated:
         terminal.line(f"not measured, estimated from the position: {', '.join(recording.estimated)}", "")
-    uncertain = " ".join(q.name for q in source.params) or "nothing"
-    kind = "" if study.system.transition is not None else " (queried)"
-    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
 
 
 def _used(study: Study, fitted: Fitted) -> str:
@@ -223,6 +229,6 @@ def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {source or directory}          # with data=NAME: on other measurements",
+        f"simpel evaluate {source or directory}          # with data=NAME: on all of a new file",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]
