@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -278,6 +279,7 @@ class TestEvaluate:
         table = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pandas()
         (tmp_path / "my" / "data").mkdir(parents=True)
         table[table["episode"] == 0].drop(columns=["episode", "split"]).to_csv(tmp_path / "my" / "run.csv")
+        shutil.copy(ROOT / "data" / "pendulum" / "card.yaml", tmp_path / "my")  # the fit knows this one
         (tmp_path / "my" / "data" / "one.yaml").write_text("path: ../run.csv\ntime: t\n")
         run(tmp_path, "evaluate", fitted, "--config-dir", "my", "data=one", "hydra.run.dir=e", "run.quiet=true")
         judged = pq.read_table(tmp_path / "e" / "predictions.parquet")

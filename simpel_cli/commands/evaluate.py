@@ -16,6 +16,7 @@ from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.records import write_metrics, write_text
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
+CARDS = (".yaml",)  # describe columns; one may lie beside several files
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit
 
 
@@ -81,7 +82,8 @@ def _new_measurements(
     if other.system.encoding != study.system.encoding:
         raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
     recording = other.recording
-    if sha256(recording.files[0]) in (record.get("inputs_sha256") or {}).values():
+    known = (record.get("inputs_sha256") or {}).values()
+    if any(sha256(file) in known for file in recording.files if file.suffix not in CARDS):
         return study  # another split of the run's own file would judge the model on what it was trained on
     recording = recording._replace(train=(), test=(*recording.train, *recording.test))
     said = f"everything is judged ({extent_of_test(recording)}): the fit was not trained on this file"
