@@ -87,7 +87,7 @@ def evaluate(
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
 ) -> None:
-    """Judge a fitted model on held-out or other measurements.
+    """Judge a fitted model on its held-out episodes, or on all of a new file.
 
     Examples:
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9

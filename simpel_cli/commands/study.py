@@ -127,7 +127,13 @@ class Fitted(NamedTuple):
     bind: Callable[[Problem], Inference]
     keys: Key[Array, " seeds"]
     training: list[tuple[np.ndarray, np.ndarray]]
+    available: int  # training transitions that `data.n_train` chose from
     normaliser: Normaliser
+
+    @property
+    def target_std(self) -> np.ndarray:
+        """Spread of the targets over the simulator's ranges, in data units, as the networks were trained with."""
+        return np.asarray(self.assembled.problems.normaliser.y_std[0], dtype=float)
 
 
 def prepare(study: Study) -> Fitted:
@@ -156,7 +162,7 @@ def prepare(study: Study) -> Fitted:
         precision=settings.precision,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
-    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, normaliser)
+    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
 
 
 def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:

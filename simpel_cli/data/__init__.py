@@ -3,5 +3,9 @@
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.reader import read
 from simpel_cli.data.recording import Check, Episode, Recording, Transitions, select, transitions
+from simpel_cli.data.segments import Places, origins, places
 
-__all__ = ["Check", "Episode", "Measurements", "Recording", "Transitions", "read", "select", "transitions"]
+__all__ = [
+    "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "origins", "places", "read", "select",
+    "transitions",
+]  # fmt: skip
