@@ -42,12 +42,12 @@ class Assessor:
 
     def __init__(self, plan: Setup, horizon: int) -> None:
         self.plan, self.horizon = plan, horizon
-        self._program = jax.jit(jax.vmap(self._window, in_axes=(None, 0, 0, 0, 0)))
+        self._program = jax.jit(jax.vmap(self._window, in_axes=(None, None, 0, 0, 0, 0, 0)))
 
     def __call__(self, z: np.ndarray, windows: Windows) -> Assessment:
         """Assess the model at unit coordinates z."""
-        data = tuple(jnp.asarray(a) for a in (windows.y, windows.ok, windows.u, windows.start))
-        track, ahead, free = self._program(jnp.asarray(z), *data)
+        bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
+        track, ahead, free = self._program(bounds, jnp.asarray(z), *windows.arrays)
         ok = np.where(windows.ok > 0, 1.0, np.nan)
         e, s = np.asarray(track.innovation) * ok, np.asarray(track.variance)
         log_likelihood = -0.5 * np.nansum(np.log(s) * ok + e**2 / s + LOG_2PI * ok, axis=(1, 2))
@@ -65,10 +65,12 @@ class Assessor:
         around = np.array([name in periodic for name in self.plan.augmented.measured])
         return np.where(around, (error + np.pi) % (2 * np.pi) - np.pi, error)
 
-    def _window(self, z: Array, y: Array, ok: Array, u: Array, start: Array) -> tuple[Track, Array, Array]:
+    def _window(
+        self, bounds: tuple[Array, ...], z: Array, y: Array, ok: Array, u: Array, start: Array, spread: Array
+    ) -> tuple[Track, Array, Array]:
         rule = self.plan.rule
-        p, noise = self.plan.coordinates.physical(z)
-        track = rule.track(p, jnp.zeros(0, int), noise, y, ok, u, start)
+        p, noise = self.plan.coordinates.bounded(bounds).physical(z)
+        track = rule.track(p, jnp.zeros(0, int), noise, y, ok, u, start, spread)
         u_sub = rule.arriving(p, u)
         rows = y.shape[0]
 

@@ -4,7 +4,7 @@ theta = (parameters and knobs p, log r, log q). In these coordinates a uniform p
 and every unknown has the same scale, so that damping and floors need no units.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +36,16 @@ class Coordinates(NamedTuple):
     driven: tuple[int, ...]
     nx: int
 
+    @property
+    def bounds(self) -> tuple[np.ndarray, ...]:
+        """What depends on the measurements: an argument of compiled programs, so that other data share them."""
+        return self.low, self.high, self.log, self.normal
+
+    def bounded(self, bounds: tuple[Any, ...]) -> "Coordinates":
+        """Return the same coordinates with other bounds, e.g. traced ones."""
+        low, high, log, normal = bounds
+        return self._replace(low=low, high=high, log=log, normal=normal)
+
     def physical(self, z: Float[Array, " n"]) -> tuple[Array, Noise]:
         """Return p and the noise at unit coordinates z."""
         value = self.low + z * (self.high - self.low)
@@ -55,9 +65,9 @@ class Coordinates(NamedTuple):
         v = self.low[index] + z * (self.high[index] - self.low[index])
         return float(np.exp(v)) if self.log[index] else float(v)
 
-    def sd_of_prior(self) -> np.ndarray:
+    def sd_of_prior(self) -> Float[Array, " n"]:
         """Standard deviation of the normal priors in unit coordinates, inf where uniform."""
-        return np.where(self.normal, 1 / (2 * CUT), np.inf)
+        return jnp.where(jnp.asarray(self.normal), 1 / (2 * CUT), jnp.inf)
 
 
 DECLARED_SD = 0.1  # of the logarithm of a measurement noise that the user declared

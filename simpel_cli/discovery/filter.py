@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import casadi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from simpel_cli.casadi_jax import checked, to_jax
@@ -48,18 +47,16 @@ class Filter(NamedTuple):
     """The filter of one augmented model.
 
     Args:
-        track: (p, rows of p that move, noise, y, ok, u, start) -> Track, for one window.
+        track: (p, rows of p that move, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`).
         flow: (p, x, u of the substeps) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         arriving: (p, u) -> inputs as they arrive, (T, substeps, nu).
-        spread: (nx,) standard deviation of the first state.
     """
 
     track: Callable[..., Track]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
     arriving: Callable[..., Float[Array, "T substeps nu"]]
-    spread: np.ndarray
 
 
 class Active(NamedTuple):
@@ -122,14 +119,13 @@ def with_slope(augmented: Augmented, of: int) -> Callable[[Array, Array, Active]
     return point
 
 
-def filter_of(augmented: Augmented, *, substeps: int, lead: int, spread: np.ndarray) -> Filter:
+def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     """Filter of an augmented model, float64.
 
     Args:
         augmented: model with candidates.
         substeps: Runge-Kutta steps per row.
         lead: rows of past input in front of each window.
-        spread: (nx,) standard deviation of the first state about its guess.
     """
     model = augmented.model
     rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
@@ -179,7 +175,9 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int, spread: np.ndar
         back = -late * rate + 0.5 * late**2 * (rate_x @ rate)
         return y + jnp.sum(slope * back, axis=1), slope - late * (slope @ rate_x)
 
-    def track(p: Array, index: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array) -> Track:
+    def track(
+        p: Array, index: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array
+    ) -> Track:
         given = active(p, index)
         u_sub = inputs(p, u)
         half = jnp.diag(noise.q**2) * (dt / 2)
@@ -207,7 +205,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int, spread: np.ndar
             out = Track(jnp.stack(errors), jnp.stack(variances), predicted, predicted_cov, x, cov, jacobian)
             return (following, after, u_k[-1], rate, rate_x), out
 
-        begin = (start, jnp.diag(jnp.asarray(spread) ** 2), u_sub[0, 0], jnp.zeros(nx), jnp.zeros((nx, nx)))
+        begin = (start, jnp.diag(spread**2), u_sub[0, 0], jnp.zeros(nx), jnp.zeros((nx, nx)))
         return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
 
     def plain_flow(p: Array, x: Array, u: Array) -> Array:
@@ -216,4 +214,4 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int, spread: np.ndar
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
         return sensors(x, u, active(p, jnp.zeros(0, int)))[0]
 
-    return Filter(track, plain_flow, plain_measure, inputs, spread)
+    return Filter(track, plain_flow, plain_measure, inputs)

@@ -67,8 +67,8 @@ class Fitter:
         self, rule: Filter, coordinates: Coordinates, windows: Windows, *, lanes: int = 8, width: int = 16
     ) -> None:
         self.coordinates, self.windows, self.lanes, self.width = coordinates, windows, lanes, width
-        self._data = tuple(jnp.asarray(a) for a in (windows.y, windows.ok, windows.u, windows.start))
-        self._program = jax.jit(jax.vmap(partial(_fit, rule, coordinates), in_axes=(None, 0, 0, 0, 0, None)))
+        self._data = windows.arrays
+        self._program = jax.jit(jax.vmap(partial(_fit, rule, coordinates), in_axes=(None, None, 0, 0, 0, 0, None)))
 
     def __call__(self, hypotheses: Sequence[Lane], most: int = MOST) -> list[Optimum]:
         """Fit every hypothesis, `lanes` at a time, with `most` iterations."""
@@ -89,6 +89,7 @@ class Fitter:
         z = np.stack([lane.z for lane in lanes])
         weight = np.stack([lane.weight for lane in lanes])
         result = self._program(
+            tuple(jnp.asarray(a) for a in self.coordinates.bounds),
             jnp.asarray(most),
             jnp.asarray(z),
             jnp.asarray(index),
@@ -118,25 +119,34 @@ def _optimum(
 
 
 def _fit(
-    rule: Filter, coordinates: Coordinates, most: Array, z: Array, index: Array, moves: Array, weight: Array, data: Any
+    rule: Filter,
+    coordinates: Coordinates,
+    bounds: tuple[Array, ...],
+    most: Array,
+    z: Array,
+    index: Array,
+    moves: Array,
+    weight: Array,
+    data: Any,
 ) -> tuple[Array, ...]:
     """Levenberg-Marquardt on Fisher information, inside the unit box."""
-    sd = jnp.asarray(coordinates.sd_of_prior())[index]
+    coordinates = coordinates.bounded(bounds)
+    sd = coordinates.sd_of_prior()[index]
     inverse_variance = jnp.where(jnp.isfinite(sd), 1 / sd**2, 0.0) * moves
     log_norm = jnp.sum(
         jnp.where(jnp.isfinite(sd) & moves, jnp.log(jnp.where(jnp.isfinite(sd), sd, 1.0)), 0.0)
     ) + 0.5 * (jnp.log(2 * jnp.pi) * jnp.sum(jnp.isfinite(sd) & moves))
 
-    def innovations(part: Array, y: Array, ok: Array, u: Array, start: Array) -> tuple[Array, Array]:
+    def innovations(part: Array, *window: Array) -> tuple[Array, Array]:
         p, noise = coordinates.physical(z.at[index].set(jnp.where(moves, part, z[index])))
-        rows = jnp.where(index < p.shape[0], index, len(coordinates.low))  # a noise is no parameter of the model
-        track = rule.track(p, rows, noise, y, ok, u, start)
+        rows = jnp.where(index < p.shape[0], index, z.shape[0])  # a noise is no parameter of the model
+        track = rule.track(p, rows, noise, *window)
         return track.innovation, track.variance
 
     def evaluate(part: Array) -> tuple[Array, Array, Array]:
-        def window(y: Array, ok: Array, u: Array, start: Array) -> tuple[Array, Array, Array]:
+        def window(y: Array, ok: Array, *rest: Array) -> tuple[Array, Array, Array]:
             def both(v: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-                out = innovations(v, y, ok, u, start)
+                out = innovations(v, y, ok, *rest)
                 return out, out
 
             (de, ds), (e, s) = jax.jacfwd(both, has_aux=True)(part)

@@ -69,10 +69,10 @@ def setup(
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
     middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     windows = windows_of(
-        recording.train, [q.name for q in model.states], measured, recording.outputs, middle, lead=lead,
+        recording.train, [q.name for q in model.states], measured, recording.outputs, middle, spread, lead=lead,
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
-    rule = filter_of(augmented, substeps=substeps, lead=lead, spread=spread)
+    rule = filter_of(augmented, substeps=substeps, lead=lead)
     r = np.array([max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured])
     driven = [q.name for q in model.states if q.name in augmented.roles.dynamic]
     typical = np.array([scales.rate[name] * np.sqrt(model.dt) for name in driven])
@@ -117,6 +117,7 @@ def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str
     model = plan.augmented.model
     middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     return windows_of(
-        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, middle, lead=plan.lead,
+        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, middle, plan.windows.spread[0],
+        lead=plan.lead,
         longest=windows_.LONGEST_TEST,
     )  # fmt: skip

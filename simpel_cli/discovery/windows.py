@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from simpel_cli.data.recording import Episode
 
@@ -19,6 +21,7 @@ class Windows(NamedTuple):
         ok: (W, T, ny) 1 where a measurement counts, else 0.
         u: (W, lead + T, nu) inputs, held from a row to the next, with `lead` rows of the past in front.
         start: (W, nx) guess of the first state.
+        spread: (W, nx) standard deviation of the first state about it.
         episode: (W,) index of the episode, in the order given.
     """
 
@@ -26,7 +29,13 @@ class Windows(NamedTuple):
     ok: np.ndarray
     u: np.ndarray
     start: np.ndarray
+    spread: np.ndarray
     episode: np.ndarray
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """What the filter takes, window by window."""
+        return tuple(jnp.asarray(a) for a in (self.y, self.ok, self.u, self.start, self.spread))
 
 
 def windows_of(
@@ -35,6 +44,7 @@ def windows_of(
     measured: Sequence[str],
     outputs: Sequence[str],
     centre: np.ndarray,
+    spread: np.ndarray,
     *,
     lead: int,
     at_least: int = 1,
@@ -48,6 +58,7 @@ def windows_of(
         measured: names of the measured channels.
         outputs: names of the columns of `Episode.outputs`.
         centre: (nx,) guess of a state that no channel measures.
+        spread: (nx,) standard deviation of a first state about its guess.
         lead: rows of past input that delays and lags look back on; before the record the first input is assumed.
         at_least: windows per episode, so that few episodes can be held out in parts.
         longest: rows of a window.
@@ -55,7 +66,7 @@ def windows_of(
     rows_of_longest = max(len(e.time) for e in episodes)
     pieces = max(at_least, -(-rows_of_longest // longest))
     length = -(-rows_of_longest // pieces)
-    rows: dict[str, list[np.ndarray]] = {"y": [], "ok": [], "u": [], "start": [], "episode": []}
+    rows: dict[str, list[np.ndarray]] = {"y": [], "ok": [], "u": [], "start": [], "spread": [], "episode": []}
     for index, episode in enumerate(episodes):
         columns = [
             episode.states[:, list(states).index(n)] if n in states else episode.outputs[:, list(outputs).index(n)]
@@ -78,5 +89,6 @@ def windows_of(
                 if name in states and ok[0, j]:
                     start[list(states).index(name)] = part[0, j]
             rows["start"].append(start)
+            rows["spread"].append(spread)
             rows["episode"].append(np.array(index))
     return Windows(*(np.stack(rows[name]) for name in Windows._fields))

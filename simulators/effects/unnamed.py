@@ -30,7 +30,8 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
                 continue
             prefix = f"unnamed_{name}_of_{argument}_w"
             amplitude = AMPLITUDE * scales.rate[name]
-            waves, shares = _harmonics(argument) if argument in periodic else _sines(argument, scales.size[argument])
+            size = _rounded(scales.size[argument])
+            waves, shares = _harmonics(argument) if argument in periodic else _sines(argument, size)
             knobs = tuple(
                 Knob(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
                 for j, sd in enumerate((amplitude * share for share in shares), start=1)
@@ -39,6 +40,12 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
             meaning = f"some function of {argument}"
             terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,)))
     return terms
+
+
+def _rounded(size: float) -> float:
+    """Round up to a few steps a decade: similar data then have the same expressions, and share compiled programs."""
+    decade = 10.0 ** math.floor(math.log10(size))
+    return next(step * decade for step in (1, 1.5, 2, 3, 5, 7, 10) if step * decade >= size * (1 - 1e-12))
 
 
 def _sines(argument: str, size: float) -> tuple[list[str], list[float]]:
