@@ -6,12 +6,15 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from simpel_cli.casadi_jax import checked
 from simpel_cli.encoding import Encoding
-from simpel_cli.integrate import rk4
+from simpel_cli.errors import ConfigError
+from simpel_cli.integrate import State, rk4
+from simpel_cli.signals import arriving
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
 
@@ -50,11 +53,38 @@ def transition(model: Model, encoding: Encoding) -> Transition:
     n_inputs = len(model.inputs)
     rows = [[q.name for q in model.outputs].index(q.name) for q in encoding.outputs]
 
+    needed = -(-model.memory() // model.dt)
+    if needed > encoding.stack:
+        raise ConfigError(
+            f"data.stack_actions: {encoding.stack}, but inputs of {model.name} act up to {model.memory():.3g} s later: a "
+            f"transition needs the {needed:.0f} inputs before its own. Use data.stack_actions={needed:.0f}."
+        )
+    params, h = [q.name for q in model.params], model.dt / model.substeps
+
+    def seconds(times: dict[str, float | str], phi: Float[Array, " dp"]) -> Float[Array, " du"]:
+        values = {**model.fixed, **{name: phi[i] for i, name in enumerate(params)}}
+        each = [times.get(q.name, 0.0) for q in model.inputs]
+        return jnp.stack([jnp.asarray(values[v] if isinstance(v, str) else v, phi.dtype) for v in each])
+
+    def follow(state: State, stacked: Float[Array, " su"], phi: Float[Array, " dp"]) -> State:
+        u = stacked[stacked.shape[0] - n_inputs :]
+        if not (model.delay or model.lag):
+            return rk4(lambda s: right_hand_side(s, u, phi)[0], state, model.dt, model.substeps)
+        late = arriving(
+            stacked.reshape(encoding.stack + 1, n_inputs), seconds(model.delay, phi), seconds(model.lag, phi),
+            dt=model.dt, substeps=model.substeps, lead=encoding.stack,
+        )  # fmt: skip
+
+        def one(state: State, u: Float[Array, " du"]) -> tuple[State, None]:
+            return rk4(lambda s: right_hand_side(s, u, phi)[0], state, h, 1), None
+
+        return jax.lax.scan(one, state, late[0])[0]
+
     def step(x: Float[Array, " dx"], phi: Float[Array, " dp"]) -> Float[Array, " dy"]:
         state, stacked = encoding.split_x(x)
         u = stacked[stacked.shape[0] - n_inputs :]
         outputs = right_hand_side(state, u, phi)[1][jnp.array(rows, int)] if rows else state[:0]
-        after = rk4(lambda s: right_hand_side(s, u, phi)[0], state, model.dt, model.substeps) if model.states else state
+        after = follow(state, stacked, phi) if model.states else state
         return encoding.to_y(state, after, outputs)
 
     return Transition(encoding, model.params, model.gap, step)

@@ -55,6 +55,8 @@ class Model:
         output: (x, u, p) -> measured quantities, one row each.
         gap: expected model error of one transition, by state or output, in its unit; empty where nothing is stated.
         fixed: the known numbers by name, for the reader and for reports.
+        delay: input: how much later it acts than it is recorded, s, or the parameter that says so.
+        lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
     """
@@ -70,7 +72,18 @@ class Model:
     output: Callable[[Symbol, Symbol, Symbol], Symbol]
     gap: dict[str, float] = field(default_factory=dict)
     fixed: dict[str, float] = field(default_factory=dict)
+    delay: dict[str, float | str] = field(default_factory=dict)
+    lag: dict[str, float | str] = field(default_factory=dict)
     symbol: Any = casadi.SX
+
+    def memory(self) -> float:
+        """Return how far back inputs act, s: the longest delay and three time constants of the longest lag."""
+        high = {q.name: q.high for q in self.params} | self.fixed
+        longest = [
+            max((high[v] if isinstance(v, str) else v for v in times.values()), default=0.0)
+            for times in (self.delay, self.lag)
+        ]
+        return longest[0] + 3 * longest[1]
 
     def function(self) -> casadi.Function:
         """Return the CasADi function (x, u, p) -> (dx, y); every argument is a column, empty ones are 0 x 1.
@@ -100,7 +113,8 @@ class Declared:
         dt: duration of one transition, s.
         substeps: RK4 steps per transition.
         states: name: {unit, range: [low, high], periodic: false}; none for a static function.
-        inputs: as states.
+        inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
+            slowly an input acts.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
         dynamics: state: expression of its time derivative, in states, inputs and parameters.
@@ -141,7 +155,8 @@ class Declared:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
         states = tuple(_variable(f"sim.states.{name}", name, node) for name, node in self.states.items())
-        inputs = tuple(_variable(f"sim.inputs.{name}", name, node) for name, node in self.inputs.items())
+        actuators = {name: _without(f"sim.inputs.{name}", node, ("delay", "lag")) for name, node in self.inputs.items()}
+        inputs = tuple(_variable(f"sim.inputs.{name}", name, node) for name, (node, _) in actuators.items())
         outputs = tuple(_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
         if not states and not outputs:
             raise ModelError(
@@ -173,6 +188,8 @@ class Declared:
             output=lambda x, u, p: terms("outputs", measured, x, u, p),
             gap=self._gap(),
             fixed=fixed,
+            delay=_times("delay", actuators, params, fixed),
+            lag=_times("lag", actuators, params, fixed),
         )
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
@@ -336,6 +353,34 @@ def _variable(path: str, name: str, node: Any) -> Quantity:
             "(convert the column of the measurements, too)"
         )
     return Quantity(name, _unit(path, node), *_range(path, node), periodic=periodic)
+
+
+def _without(path: str, node: Any, keys: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split a mapping into the rest and the named keys."""
+    _mapping(path, node)
+    return {k: v for k, v in node.items() if k not in keys}, {k: v for k, v in node.items() if k in keys}
+
+
+def _times(
+    key: str,
+    actuators: Mapping[str, tuple[Any, Mapping[str, Any]]],
+    params: tuple[Quantity, ...],
+    fixed: dict[str, float],
+) -> dict[str, float | str]:
+    """Read the delays or lags of the inputs: a number, or the name of a parameter."""
+    known = {q.name: q.low for q in params} | fixed
+    found: dict[str, float | str] = {}
+    for name, (_, own) in actuators.items():
+        if key not in own:
+            continue
+        path, value = f"sim.inputs.{name}.{key}", own[key]
+        if isinstance(value, str) and value not in known:
+            _unknown(path, f"{value!r} is neither a number (s) nor a parameter", value, known)
+        least = known[value] if isinstance(value, str) else _number(path, value)
+        found[name] = value if isinstance(value, str) else least
+        if least < 0:
+            raise ModelError(f"{path}: {least:g} s is negative; an input cannot act before it is given")
+    return found
 
 
 def _uncertain(path: str, name: str, node: Mapping[str, Any]) -> Quantity:

@@ -26,7 +26,9 @@ class Augmented(NamedTuple):
         function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, then all knobs.
         params: the rows of p.
         neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
-        operators: kind -> (index of the signal, row of p) for delays and lags.
+        operators: kind -> (index of the signal, row of p) for delays and lags, those of the model and of the terms.
+        own_delay: (nu) known delays of the model, s.
+        own_lag: (nu) known lags, s.
         roles: of the states.
     """
 
@@ -37,6 +39,8 @@ class Augmented(NamedTuple):
     params: tuple[Quantity, ...]
     neutral: np.ndarray
     operators: dict[str, tuple[tuple[int, int], ...]]
+    own_delay: tuple[float, ...]
+    own_lag: tuple[float, ...]
     roles: Structure
 
     def rows(self, term: Term) -> list[int]:
@@ -96,9 +100,16 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
         kind: tuple((signals[kind].index(t.acts_on), columns.index(t.knobs[0].name)) for t in terms if t.kind == kind)
         for kind in OPERATORS
     }
+    constant: dict[str, tuple[float, ...]] = {}
+    for kind, times in ((DELAY, model.delay), (LAG, model.lag)):
+        each = [times.get(q.name, 0.0) for q in model.inputs]
+        operators[kind] += tuple((j, columns.index(v)) for j, v in enumerate(each) if v in columns)
+        constant[kind] = tuple(0.0 if v in columns else float(model.fixed.get(str(v), v)) for v in each)
     return Augmented(
-        model, tuple(terms), tuple(measured), function, tuple(params), np.array(neutral), operators, structure(model)
-    )
+        model, tuple(terms), tuple(measured), function, tuple(params), np.array(neutral), operators, constant[DELAY],
+        constant[LAG],
+        structure(model),
+    )  # fmt: skip
 
 
 def centre(q: Quantity) -> float:

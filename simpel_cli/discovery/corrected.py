@@ -6,7 +6,7 @@ from typing import Any
 from simpel_cli.discovery.selection import Search, Trial
 from simpel_cli.discovery.verdict import interval_of
 from simulators.effects import Term
-from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR
+from simulators.effects.term import DELAY, INPUT, LAG, RATE, SENSOR, SENSOR_DELAY
 
 
 def corrected(sim: dict[str, Any], search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
@@ -27,7 +27,7 @@ def corrected(sim: dict[str, Any], search: Search, trial: Trial) -> tuple[str, d
     left_out = []
     taken = {key for section in ("states", "inputs", "parameters", "outputs") for key in sim.get(section) or {}}
     for index, term in zip(trial.terms, terms, strict=True):
-        if term.kind in OPERATORS or term.kind == SENSOR:
+        if term.kind in (SENSOR, SENSOR_DELAY):
             left_out.append(term.label)
             continue
         names: dict[str, str] = {}
@@ -51,6 +51,10 @@ def _write(node: dict[str, Any], term: Term, names: dict[str, str]) -> None:
         own = node["dynamics"][term.acts_on]
         text = _renamed(text, {"rate": f"({own})"})
         node["dynamics"][term.acts_on] = f"{own} + ({text})"
+    elif term.kind in (DELAY, LAG):
+        node["inputs"] = node["inputs"] | {
+            term.acts_on: node["inputs"][term.acts_on] | {term.kind: names[term.knobs[0].name]}
+        }
     elif term.kind == INPUT:
         for row, own in node["dynamics"].items():
             node["dynamics"][row] = _renamed(str(own), {term.acts_on: f"({text})"})

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from simpel_cli.casadi_jax import checked, to_jax
 from simpel_cli.discovery.augmented import Augmented
-from simpel_cli.discovery.signals import arriving
+from simpel_cli.signals import arriving
 from simulators.effects.term import DELAY, LAG, SENSOR_DELAY
 
 
@@ -135,14 +135,21 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     wraps = jnp.array([name in periodic for name in augmented.measured])
     delays, lags, sensor_delays = (augmented.operators[kind] for kind in (DELAY, LAG, SENSOR_DELAY))
 
-    def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int) -> Array:
-        values = jnp.zeros(size, p.dtype)
+    def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
+        values = jnp.asarray(own or (0.0,) * size, p.dtype)
         for signal, row in rows:
             values = values.at[signal].add(p[row])
         return values
 
     def inputs(p: Array, u: Array) -> Array:
-        return arriving(u, per_signal(p, delays, nu), per_signal(p, lags, nu), dt=dt, substeps=substeps, lead=lead)
+        return arriving(
+            u,
+            per_signal(p, delays, nu, augmented.own_delay),
+            per_signal(p, lags, nu, augmented.own_lag),
+            dt=dt,
+            substeps=substeps,
+            lead=lead,
+        )
 
     def flow(given: Active, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""

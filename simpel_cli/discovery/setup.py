@@ -65,7 +65,7 @@ def setup(
     terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(model, scales)
     augmented = augment(model, terms, measured)
     longest = max((k.high for t in terms if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
-    lead = int(np.ceil(longest / model.dt)) + 2
+    lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
     middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     windows = windows_of(

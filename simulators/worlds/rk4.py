@@ -6,7 +6,7 @@ from functools import cached_property
 import casadi
 import numpy as np
 
-from simulators.model import Model
+from simulators.model import Model, ModelError
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +19,15 @@ class RK4:
     """
 
     model: Model
+
+    def __post_init__(self) -> None:
+        """Refuse inputs with a memory: a query has no past."""
+        for key, times in (("delay", self.model.delay), ("lag", self.model.lag)):
+            for name in times:
+                raise ModelError(
+                    f"sim.inputs.{name}.{key}: a simulator asked for single transitions cannot hold inputs back; leave the "
+                    f"{key} out, or take a MuJoCo world, whose inputs may have one"
+                )
 
     def step(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
         """Integrate n queries over dt: states (n, dx), inputs (n, du), params (n, dp) -> (n, dx), not wrapped."""
