@@ -65,7 +65,7 @@ def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
         if config.episode is None:
             cure += " If the file holds several episodes, name their column: data.episode."
         raise DataError(
-            f"time {fault} at {table.place(int(rows.number[i + 1]))} of {table.path.name}, episode {rows.episode[i]}: "
+            f"time {fault} at {table.place(int(rows.number[i + 1]))}, episode {rows.episode[i]}: "
             f"{rows.time[i]:.6g} s, then {rows.time[i + 1]:.6g} s. {cure}"
         )
     return Check("time", True, "increasing")

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli.data import checks
-from simpel_cli.data.config import Measurements, locate
+from simpel_cli.data.config import Measurements
+from simpel_cli.data.files import by_file, locate
 from simpel_cli.data.noise import third_difference_std
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.data.resample import resample
@@ -14,7 +15,7 @@ from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
 from simpel_cli.data.smoother import estimate_speeds
 from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.table import read_table
-from simpel_cli.data.units import check_units, period, read_card
+from simpel_cli.data.units import check_units, period
 from simpel_cli.errors import DataError
 from simulators.model import Model, Quantity
 
@@ -38,17 +39,17 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
     measurable = (*model.states, *model.outputs)
     quantities = (*measurable, *model.inputs)
     config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
-    path = locate(config.path, base)
-    table = read_table(path)
-    card_units, card = read_card(path)
+    paths = tuple(locate(path, base) for path in config.paths)
+    table = read_table(paths)
     mapping = map_columns(config, model, table)
     dynamic = bool(model.states) and config.layout == "trajectories"
 
-    report = [check_units(config, table, card_units, mapping.columns, quantities)]
+    units, cards = check_units(config, table, mapping.columns, quantities)
+    report = [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
     finite, rows = checks.finite(rows, measured, _column_names(config, model, mapping))
-    split, rows = assign(config, table, rows, dynamic, config.seed_or(seed))
+    split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
     report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.stale, checks.ranges)]
     if config.layout == "transitions":
@@ -68,7 +69,7 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
         noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
         estimated=mapping.unmeasured,
         checks=tuple(report),
-        files=(path, card) if card is not None else (path,),
+        files=(*paths, *cards),
     )
 
 

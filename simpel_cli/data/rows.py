@@ -69,7 +69,7 @@ def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
     unmeasured = tuple(name for name in states if name not in columns)
     if not measured_outputs and len(unmeasured) == len(states):
         raise DataError(
-            f"nothing of {table.path.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
+            f"nothing of {table.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
             f"Say `columns: {{{[*states, *outputs, 'name'][0]}: <name>}}`."
         )
     return Mapping(columns, measured_outputs, unmeasured)
@@ -84,13 +84,7 @@ def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) 
         DataError: a column is missing or holds text where numbers should be.
     """
     n = len(table)
-    if config.episode is not None:
-        episode = _labels(table, config.episode, "data.episode")
-    elif config.layout == "transitions" and config.split.get("by") != "time":
-        # rows do not follow each other, so that each can go to train or test on its own
-        episode = np.arange(n).astype(str)
-    else:
-        episode = np.full(n, "0")
+    episode = _episodes(config, table)
     order, position = _by_episode(episode)
     names = [q.name for q in model.states]
     following = [_following(table, mapping, name) for name in names] if config.layout == "transitions" else []
@@ -110,6 +104,22 @@ def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) 
 def split_labels(config: Measurements, table: Table, column: str) -> np.ndarray:
     """Column that says of every row of the file whether it is train or test, (n,) text."""
     return _labels(table, column, "data.split.column")
+
+
+def _episodes(config: Measurements, table: Table) -> np.ndarray:
+    """Name of every row's episode, (n,) text; no episode runs on from one file into another."""
+    n, file = len(table), table.file
+    if config.episode is None:
+        if config.layout == "transitions" and config.split.get("by") != "time":
+            # rows do not follow each other, so that each can go to train or test on its own
+            return np.arange(n).astype(str)
+        return np.array(table.stems)[file] if len(table.sheets) > 1 else np.full(n, "0")
+    label = _labels(table, config.episode, "data.episode")
+    pairs = {(name, i) for name, i in zip(label.tolist(), file.tolist(), strict=True) if name}
+    if len(pairs) == len({name for name, _ in pairs}):
+        return label
+    prefixed = np.char.add(np.char.add(np.array(table.stems)[file], ":"), label)
+    return np.where(label == "", "", prefixed)
 
 
 def _labels(table: Table, column: str, key: str) -> np.ndarray:
