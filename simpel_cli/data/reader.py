@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.data import checks
+from simpel_cli.data import checks, sensor_checks
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.files import by_file, locate
+from simpel_cli.data.kinematics import Motion, derived, kinematics
 from simpel_cli.data.noise import third_difference_std
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
-from simpel_cli.data.smoother import estimate_speeds
+from simpel_cli.data.smoother import estimate_speeds, speeds
 from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.table import read_table
 from simpel_cli.data.units import check_units, period
@@ -51,7 +52,7 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
     finite, rows = checks.finite(rows, measured, _column_names(config, model, mapping))
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
-    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.stale, checks.ranges)]
+    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.ranges)]
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
@@ -79,8 +80,8 @@ def _trajectories(
     """Episodes by split, noise by quantity, checks."""
     sampling, raw = checks.sampling(rows, model, config)
     gaps, starts = checks.gaps(rows, raw, config.max_gap)
-    report = [sampling, gaps]
     tagged = _segments(model, rows, starts)
+    report = [sampling, gaps, *_sensors(model, mapping, [episode for _, episode in tagged], raw)]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
@@ -99,6 +100,31 @@ def _trajectories(
     kept, short = _long_enough(config, model, episodes)
     report += [short, _noise_check(config, model, noise)]
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
+
+
+def _sensors(model: Model, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
+    """Faults of the sensors and the clock, of the rows as they were measured."""
+    observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
+    columns = {
+        q.name: [np.concatenate([s.states, s.outputs], axis=1)[:, i] for s in segments]
+        for i, q in enumerate(observed)
+        if q.name in mapping.columns
+    }
+    units = {q.name: q.unit for q in observed}
+    times = [segment.time for segment in segments]
+    motions = [
+        Motion(p, v, units[v], list(zip(times, columns[p], columns[v], strict=True)))
+        for v, positions in (speeds(model) if model.states else {}).items()
+        for p in positions
+        if p in columns and v in columns
+    ]
+    return [
+        sensor_checks.jitter(times, dt),
+        sensor_checks.stale(columns),
+        sensor_checks.quantisation(columns, units),
+        kinematics(motions),
+        derived(motions),
+    ]
 
 
 def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
