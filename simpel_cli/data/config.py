@@ -37,7 +37,8 @@ class Measurements:
         units: quantity of the simulator -> unit of its column, compared with the simulator's. Also read from Parquet
             field metadata (`unit`) and from `card.yaml` beside the file (`columns: {phi: {unit: rad}}`).
         stack_actions: number of past inputs that a transition carries along.
-        max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt of the data.
+        max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt, of the data or, if that is longer,
+            of what they are resampled to.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.

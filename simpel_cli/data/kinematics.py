@@ -18,7 +18,8 @@ TOLERANCE = 0.05  # of the scale, and of the velocity's standard deviation for a
 SIGNIFICANCE = 5.0  # standard errors
 UNRELATED = 0.5  # of the variance of the position's changes; more left unexplained is not this position's rate
 NOISE_SHARE = 4.0  # times the variance of the noise, which is an estimate, may stay unexplained
-FEW_WINDOWS = 8
+FEW_WINDOWS = 12
+RESTING = 4.0  # times the variance that its noise alone gives the integrated velocity; below, it tells nothing
 DERIVED = 0.25  # of the velocity's noise; an independent sensor differs from a difference by at least all of it
 NOISE_FREE = 1e-6  # of the velocity: less noise is rounding, and tells nothing of where the numbers came from
 FACTORS = {  # velocity column / rate of the position
@@ -90,7 +91,7 @@ def derived(motions: Sequence[Motion]) -> Check:
 
 
 def agreement(motion: Motion) -> Agreement | None:
-    """Fit scale and offset between a velocity and the rate of its position; None where the rows are too few or at rest."""
+    """Fit scale and offset between a velocity and the rate of its position; None where rows are too few, or rest."""
     from scipy.interpolate import CubicSpline  # here, since its import takes long
 
     pieces = [piece for piece in motion.pieces if len(piece[0]) >= 4]
@@ -102,11 +103,14 @@ def agreement(motion: Motion) -> Agreement | None:
         width = 1 << power
         rows = [np.stack([t, p, s])[:, : (len(t) - 1) // width * width + 1 : width] for t, p, s in walked]
         windows = np.concatenate([np.diff(columns, axis=1) for columns in rows], axis=1)
-        signal = float(np.sum(windows[2] ** 2))
-        if windows.shape[1] < FEW_WINDOWS or signal == 0:
+        if windows.shape[1] < FEW_WINDOWS:
             continue
+        signal = float(np.sum(windows[2] ** 2))
         dt = float(np.mean(windows[0])) / width
-        variance = 2 * noise[0] ** 2 + width * (dt * noise[1]) ** 2
+        of_velocity = width * (dt * noise[1]) ** 2
+        if signal <= RESTING * windows.shape[1] * of_velocity:
+            continue
+        variance = 2 * noise[0] ** 2 + of_velocity
         if best is None or variance / signal < best[0]:
             best = variance / signal, variance, windows
     if best is None:
@@ -165,12 +169,14 @@ def _fault(motion: Motion) -> str | None:
     if found is None:
         return None
     pair = f"{motion.velocity} and d({motion.position})/dt"
-    if found.unexplained > UNRELATED:
+    scale, error = 1 / found.ratio, found.ratio_error / abs(found.ratio)
+    wrong = abs(found.ratio - 1) > TOLERANCE and abs(scale - 1) > SIGNIFICANCE * error
+    if found.unexplained > UNRELATED or (wrong and abs(scale) < SIGNIFICANCE * error):
         return (
             f"{pair} do not go together: {found.unexplained:.0%} of the position's changes are not in the velocity. "
             "Wrong column, other units, a delay between the two, or an angle that turns more than half a turn per row"
         )
-    if abs(found.ratio - 1) > TOLERANCE and abs(found.ratio - 1) > SIGNIFICANCE * found.ratio_error * abs(found.ratio):
+    if wrong:
         return f"{motion.velocity} is {found.ratio:.4g} times d({motion.position})/dt{_hint(found.ratio, motion)}"
     spread = float(np.std(np.concatenate([v for _, _, v in motion.pieces])))
     if abs(found.offset) > max(TOLERANCE * spread, SIGNIFICANCE * found.offset_error):

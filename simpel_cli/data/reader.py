@@ -79,9 +79,9 @@ def _trajectories(
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
     """Episodes by split, noise by quantity, checks."""
     sampling, raw = checks.sampling(rows, model, config)
-    gaps, starts = checks.gaps(rows, raw, config.max_gap)
+    gaps, starts = checks.gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
-    report = [sampling, gaps, *_sensors(model, mapping, [episode for _, episode in tagged], raw)]
+    report = [sampling, gaps, *_sensors(config, model, mapping, [episode for _, episode in tagged], raw)]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
@@ -102,7 +102,7 @@ def _trajectories(
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
 
 
-def _sensors(model: Model, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
+def _sensors(config: Measurements, model: Model, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
     """Faults of the sensors and the clock, of the rows as they were measured."""
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
     columns = {
@@ -119,7 +119,7 @@ def _sensors(model: Model, mapping: Mapping, segments: list[Episode], dt: float)
         if p in columns and v in columns
     ]
     return [
-        sensor_checks.jitter(times, dt),
+        sensor_checks.jitter(times, dt, model.dt if config.resample is None else None),
         sensor_checks.stale(columns),
         sensor_checks.quantisation(columns, units),
         kinematics(motions),

@@ -68,12 +68,13 @@ def quantisation(signals: Mapping[str, Sequence[np.ndarray]], units: Mapping[str
     return Check("quantisation", not found, "; ".join(found) if found else "no sensor is coarser than its noise")
 
 
-def jitter(times: Sequence[np.ndarray], dt: float) -> Check:
+def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None) -> Check:
     """Find time stamps that are not equidistant.
 
     Args:
         times: of contiguous rows, each (T,) s.
         dt: of the data, s.
+        wanted: dt to resample to, s, for the advice; None: the data are resampled anyway, so that jitter does no harm.
     """
     steps = np.concatenate([np.diff(time) for time in times]) if times else np.empty(0)
     share = irregular_share(steps, dt)
@@ -81,7 +82,10 @@ def jitter(times: Sequence[np.ndarray], dt: float) -> Check:
         return Check("jitter", True, "every step is dt")
     low, high = np.percentile(steps, [1, 99])
     detail = f"{share:.1%} of the steps differ from dt by more than 2 % (1 to 99 % of them: {low:.3g} to {high:.3g} s)"
-    return Check("jitter", share <= IRREGULAR_SHARE, detail)
+    if share <= IRREGULAR_SHARE:
+        return Check("jitter", True, detail)
+    cure = "resampled to equal steps" if wanted is None else f"data.resample: {wanted:.6g} makes them equal"
+    return Check("jitter", wanted is None, f"{detail}; {cure}")
 
 
 def irregular_share(steps: np.ndarray, dt: float) -> float:

@@ -1,6 +1,5 @@
 """A Parquet or CSV file as named columns, with messages that a person can act on."""
 
-import csv
 import re
 from collections import Counter
 from contextlib import suppress
@@ -10,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pyarrow import csv as arrow_csv
 from pyarrow import parquet
 
+from simpel_cli.data.csv_file import BLANKS, Dialect, line_of, read_csv
 from simpel_cli.errors import DataError
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
@@ -26,11 +25,13 @@ class Sheet:
         path: the file.
         columns: name -> Arrow column, all of the same length.
         units: name -> unit, from Parquet field metadata.
+        dialect: of a CSV file.
     """
 
     path: Path
     columns: dict[str, pa.ChunkedArray]
     units: dict[str, str] = field(default_factory=dict)
+    dialect: Dialect = Dialect()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -68,12 +69,7 @@ class Sheet:
         """Name a row as a person finds it: the line of a CSV file, the row of a Parquet file counted from 0."""
         if self.path.suffix.lower() != ".csv":
             return f"row {index} (counted from 0)"
-        line = index + 2
-        with suppress(csv.Error), self.path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-            reader = csv.reader(file)
-            filled = (reader.line_num for record in reader if record)
-            line = next((number for i, number in enumerate(filled) if i == index + 1), line)
-        return f"line {line}"
+        return f"line {line_of(self.path, self.dialect, index)}"
 
     def _not_a_number(self, name: str, column: pa.ChunkedArray) -> DataError:
         if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
@@ -82,6 +78,12 @@ class Sheet:
         cure = "Write numbers with a decimal point, and leave a missing one empty."
         if DECIMAL_COMMA.fullmatch(text):
             cure = f"It looks like a decimal comma: write {text.replace(',', '.')}."
+            if self.dialect.separator != ",":
+                separator = r"\s+" if self.dialect.separator == BLANKS else self.dialect.separator
+                cure += (
+                    f" All at once: pandas.read_csv('{self.path.name}', sep={separator!r}, decimal=',')"
+                    f".to_csv(..., index=False)"
+                )
         return DataError(
             f"column '{name}' of {self.path.name} should hold numbers, but {self.place(index)} has {text[:40]!r}. "
             f"{cure}"
@@ -120,63 +122,8 @@ def _read_parquet(path: Path) -> Sheet:
 
 
 def _read_csv(path: Path) -> Sheet:
-    header = _header(path)
-    faulty: list[arrow_csv.InvalidRow] = []
-
-    def remember(row: arrow_csv.InvalidRow) -> str:
-        faulty.append(row)
-        return "error"
-
-    # Everything is read as text, the header too: Arrow's own guess of types fails far from the entry that is at fault.
-    texts = {f"f{i}": pa.string() for i in range(header.count(",") + 1)}
-    try:
-        content = arrow_csv.read_csv(
-            path,
-            read_options=arrow_csv.ReadOptions(autogenerate_column_names=True, use_threads=False),
-            parse_options=arrow_csv.ParseOptions(invalid_row_handler=remember),
-            convert_options=arrow_csv.ConvertOptions(column_types=texts, strings_can_be_null=True),
-        )
-    except (pa.ArrowException, OSError) as error:
-        raise _unreadable_csv(path, faulty) from error
-    names = [str(column[0].as_py() or "").strip() for column in content.columns]
-    if names and all(_is_number(name) for name in names):
-        raise DataError(f"{path.name} starts with numbers. Its first line must name the columns, e.g. t,phi,u.")
-    _refuse_repeated(path, [name for name in names if name])
-    return Sheet(path, {name: column[1:] for name, column in zip(names, content.columns, strict=True) if name})
-
-
-def _header(path: Path) -> str:
-    """First line of a CSV file.
-
-    Raises:
-        DataError: it is not UTF-8 text, or its separator is not a comma.
-    """
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            header = file.readline()
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path.name} is not UTF-8 text. Save it as CSV in UTF-8.") from error
-    for separator, name in ((";", "';'"), ("\t", "a tab")):
-        if separator in header and "," not in header:
-            raise DataError(
-                f"{path.name} separates its columns by {name}; a comma is needed. Convert it once: "
-                f"pandas.read_csv('{path.name}', sep={separator!r}, decimal=',').to_csv(..., index=False), "
-                "with decimal='.' if its numbers have a decimal point."
-            )
-    return header
-
-
-def _unreadable_csv(path: Path, faulty: list[arrow_csv.InvalidRow]) -> DataError:
-    if not faulty:
-        return DataError(f"{path.name} cannot be read as CSV: it is empty, damaged or not UTF-8 text.")
-    row = faulty[0]
-    comma = (
-        " If its numbers have a decimal comma (0,5), write 0.5." if row.actual_columns > row.expected_columns else ""
-    )
-    return DataError(
-        f"{path.name} has {row.expected_columns} columns, but record {row.number} (the header is record 1) has "
-        f"{row.actual_columns}: {row.text[:60]!r}.{comma}"
-    )
+    columns, dialect = read_csv(path)
+    return Sheet(path, columns, dialect=dialect)
 
 
 def _refuse_repeated(path: Path, names: list[str]) -> None:

@@ -90,7 +90,10 @@ def test_a_constant_speed_and_rest_tell_what_they_can() -> None:
     assert kinematics([Motion("a", "w", "rad/s", turning)]).ok
     degrees = [(t, 5 * t + noise[0], np.degrees(5 + noise[1]))]
     assert "looks like degrees per s" in kinematics([Motion("a", "w", "deg/s", degrees)]).detail
-    assert kinematics([Motion("a", "w", "rad/s", [(t, noise[0], noise[1])])]).ok
+    for _ in range(50):
+        assert kinematics([Motion("a", "w", "rad/s", [(t, *RNG.normal(0, 0.001, (2, 300)))])]).ok
+    stuck = kinematics([Motion("a", "w", "rad/s", [(t, noise[0], motion(t)[1])])])
+    assert "w and d(a)/dt do not go together" in stuck.detail
     assert kinematics([Motion("a", "w", "rad/s", [(t, 0 * t, 0 * t)])]).ok
     assert kinematics([Motion("a", "w", "rad/s", [(t[:3], t[:3], t[:3])])]).ok
 

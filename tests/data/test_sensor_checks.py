@@ -59,7 +59,7 @@ def test_clean_noisy_data_pass_in_99_of_100_records() -> None:
         times, positions, speeds = (list(column) for column in zip(*pieces, strict=True))
         pair = [Motion("a", "w", "rad/s", pieces)]
         columns = {"a": positions, "w": speeds}
-        checks = (jitter(times, dt), stale(columns), quantisation(columns, {}), kinematics(pair), derived(pair))
+        checks = (jitter(times, dt, dt), stale(columns), quantisation(columns, {}), kinematics(pair), derived(pair))
         alarms += [(seed, c) for c in checks if not c.ok]
     assert len(alarms) < 2, alarms
 
@@ -125,8 +125,11 @@ def test_quantisation_is_reported_where_it_exceeds_the_noise() -> None:
 def test_jitter() -> None:
     rng = np.random.default_rng(0)
     even = 0.1 * np.arange(200)
-    assert jitter([even, even + 5], 0.1) == Check("jitter", True, "every step is dt")
-    assert jitter([even + rng.uniform(-5e-4, 5e-4, 200)], 0.1).ok
-    found = jitter([np.cumsum(rng.uniform(0.05, 0.14, 200))], 0.095)
+    assert jitter([even, even + 5], 0.1, 0.1) == Check("jitter", True, "every step is dt")
+    assert jitter([even + rng.uniform(-5e-4, 5e-4, 200)], 0.1, 0.1).ok
+    uneven = np.cumsum(rng.uniform(0.05, 0.14, 200))
+    found = jitter([uneven], 0.095, 0.1)
     assert not found.ok
     assert "% of the steps differ from dt by more than 2 %" in found.detail
+    assert "data.resample: 0.1 makes them equal" in found.detail
+    assert jitter([uneven], 0.095, None).ok
