@@ -240,7 +240,10 @@ def _gap_scale(
         declared = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
     if not np.isnan(declared).any():
         return declared
-    subset = slice(0, SCALE_POINTS)
+    subset: slice | np.ndarray = slice(None)
+    if len(x) > SCALE_POINTS:  # the first ones may all be of one episode
+        key, key_rows = jax.random.split(key)
+        subset = np.asarray(jax.random.choice(key_rows, len(x), (SCALE_POINTS,), replace=False))
     samples = (system.simulate(key, x[subset], SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
     normalised = (x[subset] - normaliser.x_mean) / normaliser.x_std
     correlation = np.asarray(

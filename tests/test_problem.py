@@ -8,7 +8,7 @@ import pytest
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.inference import NoiseModel, padded_length
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
-from simpel_cli.problem import WORLD_POINTS, assemble, normaliser_of, system_of
+from simpel_cli.problem import SCALE_POINTS, WORLD_POINTS, assemble, normaliser_of, system_of
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Declared, ModelError
 from simulators.worlds.callable_world import CallableWorld
@@ -127,6 +127,28 @@ def test_wrong_answers_of_a_world_are_named():
         world(lambda s, u, a: s[0]).step(np.zeros((3, 1)), np.zeros((3, 1)), np.ones((3, 1)))
     with pytest.raises(SimpelError, match="returned \\[nan\\]"):
         normaliser_of(system_of(world(lambda s, u, a: s * np.nan), (), 0), KEY)
+
+
+def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
+    """Rows in the order of the file: the first half agrees with the simulator, the second is off by a smooth gap."""
+    system = system_of(declared(), (), 0)
+    normaliser = normaliser_of(system, KEY)
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (400, 1)), rng.uniform(-2, 2, (400, 1))
+    gap = np.where(np.arange(400)[:, None] < 200, 0.0, 0.3 * states**2 + 0.3 * inputs)
+    x = system.encoding.to_x(states, inputs)
+    y = exact(states, inputs, np.ones((400, 1))) - states + gap
+
+    def chosen(rows, key):
+        return assemble(
+            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [(x[rows], y[rows])], {}, {},
+            noise=NoiseModel(), pool=16, keys=[key], precision="float32",
+        ).gap_scale[0]  # fmt: skip
+
+    quiet = chosen(slice(0, SCALE_POINTS), KEY)
+    assert chosen(slice(None), KEY) > 3 * quiet
+    assert chosen(slice(None), KEY) == chosen(slice(None), KEY)
+    assert chosen(slice(None), KEY) != chosen(slice(None), jax.random.key(1))
 
 
 def test_learned_noise_starts_at_and_stays_above_what_was_measured():
