@@ -110,6 +110,8 @@ CASES = [
         "allowed are classes of simpel_cli, simulators"),
     sim("target read_pickle", "simulators.model.Declared", "pandas.read_pickle", "got pandas.read_pickle"),
     sim("target is a function", "simulators.model.Declared", "simulators.expression.parse", "is not a dataclass"),
+    sim("root of something negative", "(c*u - k*s)/m", "(c*u - k*s)/m - sqrt(s)",
+        "sim: cart is not finite after one transition from state s = -0.", "input u = ", "parameters m = ", "sqrt(max(h, 0))"),
     sim("typo in a class", "simulators.model.Declared", "simulators.model.Declard", "Did you mean Declared?"),
     sim("typo in a module", "simulators.model.Declared", "simulators.modl.Declared", "cannot import simulators.modl"),
     sim("target without module", "simulators.model.Declared", "Declared", "sim._target_: got Declared"),
