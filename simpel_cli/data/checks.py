@@ -5,14 +5,14 @@ import math
 import numpy as np
 
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.recording import Check
+from simpel_cli.data.recording import Check, Source
 from simpel_cli.data.rows import Rows
 from simpel_cli.data.sensor_checks import IRREGULAR_SHARE, irregular_share
 from simpel_cli.data.smoother import speeds
 from simpel_cli.data.table import Table
 from simpel_cli.data.units import period
 from simpel_cli.errors import ConfigError, DataError
-from simulators.model import Model, Quantity
+from simulators.model import Quantity
 
 DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
 MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
@@ -75,7 +75,7 @@ def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
     return Check("time", True, "increasing")
 
 
-def sampling(rows: Rows, model: Model, config: Measurements) -> tuple[Check, float]:
+def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, float]:
     """Compare the distance of the rows with the simulator's dt.
 
     Returns:
@@ -148,7 +148,7 @@ def _bridge(steps: np.ndarray, limit: float, before: str) -> str:
     return f"{before}data.max_gap: {math.ceil(longest / digit) * digit:.4g}"
 
 
-def constant(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+def constant(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
     """Warn of columns that never change.
 
     Raises:
@@ -162,7 +162,7 @@ def constant(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
     return Check("constant", not still, f"constant: {', '.join(still)}" if still else "every column changes")
 
 
-def ranges(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+def ranges(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
     """Count values outside the simulator's declared ranges; angles are compared modulo a turn.
 
     Where most of an angle or a turn rate is outside, it may be in degrees. An angle in degrees is inside modulo a turn,
@@ -185,7 +185,7 @@ def ranges(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
     return Check("ranges", not found, "; ".join(found) if found else "all values inside the declared ranges")
 
 
-def _too_fast(rows: Rows, values: np.ndarray, angle: Quantity, model: Model) -> bool:
+def _too_fast(rows: Rows, values: np.ndarray, angle: Quantity, model: Source) -> bool:
     """Whether an angle lies mostly outside its range, and turns faster than its speed's range, or than can be seen."""
     if np.mean((values < angle.low) | (values > angle.high)) <= MOSTLY or not _follows(rows).any():
         return False
@@ -207,7 +207,7 @@ def _outside(values: np.ndarray, quantity: Quantity) -> np.ndarray:
     return (values < quantity.low - slack) | (values > quantity.high + slack)
 
 
-def _named(rows: Rows, model: Model, outputs: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _named(rows: Rows, model: Source, outputs: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Measured columns by name: states, inputs, outputs."""
     states = {q.name: column for q, column in zip(model.states, rows.states.T, strict=True)}
     measured = {name: column for name, column in states.items() if not np.isnan(column).all()}

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from simpel_cli.data.recording import Source
 from simulators.model import Model
 
 PROBES = 16  # random points at which the rate must grow, or fall, over the whole range of z
@@ -36,8 +37,10 @@ class Solved(NamedTuple):
     sensitivity: float  # median |df/dz|, which divides the noise of the rate
 
 
-def drive(model: Model, name: str, unmeasured: Collection[str]) -> Drive | None:
+def drive(model: Source, name: str, unmeasured: Collection[str]) -> Drive | None:
     """Find a measured state whose rate tells the unmeasured one: it depends on no other, and always in one direction."""
+    if not isinstance(model, Model):
+        return None  # a world shows no equations
     names = [q.name for q in model.states]
     z = names.index(name)
     rows, columns = (np.array(index) for index in model.function().jac_sparsity(0, 0).get_triplet())

@@ -10,7 +10,7 @@ from simpel_cli.data.config import Measurements
 from simpel_cli.data.files import by_file, locate
 from simpel_cli.data.kinematics import Motion, derived, kinematics
 from simpel_cli.data.noise import third_difference_std
-from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
 from simpel_cli.data.smoother import estimate_speeds, speeds
@@ -18,10 +18,10 @@ from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.table import read_table
 from simpel_cli.data.units import check_units, period
 from simpel_cli.errors import DataError
-from simulators.model import Model, Quantity
+from simulators.model import Quantity
 
 
-def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording:
+def read(config: Measurements, model: Source, base: Path, seed: int) -> Recording:
     """Read measurements for a simulator.
 
     Args:
@@ -75,7 +75,7 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
 
 
 def _trajectories(
-    config: Measurements, model: Model, rows: Rows, mapping: Mapping
+    config: Measurements, model: Source, rows: Rows, mapping: Mapping
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
     """Episodes by split, noise by quantity, checks."""
     sampling, raw = checks.sampling(rows, model, config)
@@ -102,7 +102,7 @@ def _trajectories(
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
 
 
-def _sensors(config: Measurements, model: Model, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
+def _sensors(config: Measurements, model: Source, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
     """Faults of the sensors and the clock, of the rows as they were measured."""
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
     columns = {
@@ -114,7 +114,7 @@ def _sensors(config: Measurements, model: Model, mapping: Mapping, segments: lis
     times = [segment.time for segment in segments]
     motions = [
         Motion(p, v, units[v], list(zip(times, columns[p], columns[v], strict=True)))
-        for v, positions in (speeds(model) if model.states else {}).items()
+        for v, positions in speeds(model).items()
         for p in positions
         if p in columns and v in columns
     ]
@@ -127,7 +127,7 @@ def _sensors(config: Measurements, model: Model, mapping: Mapping, segments: lis
     ]
 
 
-def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
+def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
     """Contiguous rows with their split; a second segment of episode 3 is called 3/2. Angles are unwrapped."""
     first = np.flatnonzero(starts)
     seen: Counter[str] = Counter()
@@ -146,7 +146,7 @@ def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, E
     return segments
 
 
-def _pairs(config: Measurements, model: Model, rows: Rows, part: str) -> tuple[Episode, ...]:
+def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[Episode, ...]:
     """Rows that are transitions on their own, one `Episode` per named episode, or one for all."""
     chosen = rows.take(rows.split == part)
     following = chosen.next_states.copy()
@@ -172,7 +172,7 @@ def _unwrap(values: np.ndarray, quantities: tuple[Quantity, ...]) -> np.ndarray:
     return turned
 
 
-def _long_enough(config: Measurements, model: Model, episodes: tuple[Episode, ...]) -> tuple[list[Episode], Check]:
+def _long_enough(config: Measurements, model: Source, episodes: tuple[Episode, ...]) -> tuple[list[Episode], Check]:
     """Keep segments with at least one transition."""
     least = config.stack_actions + (2 if model.states else 1)
     kept = [episode for episode in episodes if len(episode.time) >= least]
@@ -183,7 +183,7 @@ def _long_enough(config: Measurements, model: Model, episodes: tuple[Episode, ..
     return kept, Check("length", short == 0, detail)
 
 
-def _noise(config: Measurements, model: Model, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
+def _noise(config: Measurements, model: Source, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
     """Standard deviation of the noise per measured state and output, declared or estimated, before any filter."""
     names = [q.name for q in model.states] + list(mapping.outputs)
     std = {}
@@ -199,7 +199,7 @@ def _noise(config: Measurements, model: Model, mapping: Mapping, train: list[Epi
     return std
 
 
-def _noise_check(config: Measurements, model: Model, noise: dict[str, float]) -> Check:
+def _noise_check(config: Measurements, model: Source, noise: dict[str, float]) -> Check:
     units = {q.name: q.unit for q in (*model.states, *model.outputs)}
     shown = [
         f"{name} {config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
@@ -209,7 +209,7 @@ def _noise_check(config: Measurements, model: Model, noise: dict[str, float]) ->
     return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
 
 
-def _column_names(config: Measurements, model: Model, mapping: Mapping) -> tuple[str, ...]:
+def _column_names(config: Measurements, model: Source, mapping: Mapping) -> tuple[str, ...]:
     """Columns behind `checks.finite`, in its order."""
     states = [mapping.columns[q.name] for q in model.states if q.name in mapping.columns]
     inputs = [mapping.columns[q.name] for q in model.inputs]

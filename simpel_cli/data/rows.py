@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.data.config import Measurements
+from simpel_cli.data.recording import Source
 from simpel_cli.data.table import Table
 from simpel_cli.errors import DataError
-from simulators.model import Model
 
 
 class Rows(NamedTuple):
@@ -36,7 +36,7 @@ class Mapping(NamedTuple):
     unmeasured: tuple[str, ...]  # states
 
 
-def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
+def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
     """Find the column of every quantity.
 
     An output without a column is left out; a state can be declared as not measured; inputs must be there.
@@ -75,7 +75,7 @@ def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
     return Mapping(columns, measured_outputs, unmeasured)
 
 
-def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) -> Rows:
+def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping) -> Rows:
     """Bring the columns of a file into the simulator's order, rows sorted by episode (in order of appearance).
 
     `split` stays empty here.
@@ -128,7 +128,7 @@ def _labels(table: Table, column: str, key: str) -> np.ndarray:
     return table.labels(column)
 
 
-def _time(config: Measurements, model: Model, table: Table, position: np.ndarray) -> np.ndarray:
+def _time(config: Measurements, model: Source, table: Table, position: np.ndarray) -> np.ndarray:
     if config.time is None:
         return position * model.dt
     if config.time not in table.columns:

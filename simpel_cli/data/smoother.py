@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 
 from simpel_cli.data.hidden import Drive, drive, solve
-from simpel_cli.data.recording import Check, Episode
+from simpel_cli.data.recording import Check, Episode, Source
 from simpel_cli.errors import DataError
 from simulators.model import Model
 
@@ -39,12 +39,15 @@ class Smoothed(NamedTuple):
     check: Check
 
 
-def speeds(model: Model) -> dict[str, list[str]]:
-    """States v with d(p)/dt = v exactly, whatever the inputs and parameters: v -> its positions p."""
-    function = model.function()
+def speeds(model: Source) -> dict[str, list[str]]:
+    """States v with d(p)/dt = v exactly, whatever the inputs and parameters: v -> its positions p.
+
+    Nothing is known of a world, which shows no equations.
+    """
     n_states = len(model.states)
-    if n_states == 0:
+    if n_states == 0 or not isinstance(model, Model):
         return {}
+    function = model.function()
     rng = np.random.default_rng(0)
     points = [
         np.array([rng.uniform(q.low, q.high) for q in group]) for group in (model.states, model.inputs, model.params)
@@ -64,7 +67,7 @@ def speeds(model: Model) -> dict[str, list[str]]:
     return found
 
 
-def estimate_speeds(model: Model, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float) -> Smoothed:
+def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float) -> Smoothed:
     """Fill in the states that were not measured: speeds first, then what drives a measured state (`hidden`).
 
     Args:
@@ -101,6 +104,7 @@ def estimate_speeds(model: Model, episodes: Sequence[Episode], unmeasured: tuple
         done.append(f"{name} = d({position})/dt of a smoothing spline (window about {lam**0.25 * raw:.2g} s, by GCV)")
     leans = False
     for name, found in drives.items():
+        assert isinstance(model, Model)  # of a world nothing is known that could be solved
         lam = choose_smoothing([episode.states[:, found.seen] for episode in long])
         solved = []
         for episode in long:
@@ -171,7 +175,7 @@ def _slope(time: np.ndarray, position: np.ndarray, lam: float, raw: float) -> np
 
 
 def _driven(
-    model: Model, name: str, unmeasured: tuple[str, ...], relations: dict[str, list[str]], source: Mapping[str, str]
+    model: Source, name: str, unmeasured: tuple[str, ...], relations: dict[str, list[str]], source: Mapping[str, str]
 ) -> Drive:
     """How a state that is no speed shows in a measured one; speeds count as measured by now."""
     found = drive(model, name, [other for other in unmeasured if other not in source])
