@@ -42,10 +42,10 @@ class Table:
 
     @property
     def stems(self) -> tuple[str, ...]:
-        """A short name per file that no other has: `train` of train.csv, or `a/run` where b/run.csv is another."""
+        """A short name per file that no other has: `train` of train.csv, or `a-run` where b/run.csv is another."""
         paths = [sheet.path.with_suffix("") for sheet in self.sheets]
         for depth in range(1, max(len(path.parts) for path in paths) + 1):
-            names = tuple("/".join(path.parts[-depth:]) for path in paths)
+            names = tuple("-".join(path.parts[-depth:]) for path in paths)  # a slash stands before segments
             if len(set(names)) == len(names):
                 return names
         return tuple(str(sheet.path) for sheet in self.sheets)  # run.csv beside run.parquet

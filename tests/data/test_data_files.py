@@ -58,7 +58,7 @@ def test_without_an_episode_column_a_file_is_an_episode(tmp_path: Path) -> None:
     write(tmp_path, "b/run.csv", 300)
     write(tmp_path, "c/last.csv", 500)
     recording = read_files(tmp_path, "a/run.csv", "b/run.csv", "c/last.csv", episode=None)
-    assert firsts(recording) == ({"a/run": 100, "b/run": 300}, {"c/last": 500})
+    assert firsts(recording) == ({"a-run": 100, "b-run": 300}, {"c/last": 500})
 
 
 def test_a_row_without_an_episode_is_still_dropped(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_test_files_that_do_not_fit(tmp_path: Path, test_files: list[str], messa
     with pytest.raises(ConfigError, match=message):
         read_files(tmp_path, "train.csv", "a/run.csv", "b/run.csv", split={"test_files": test_files})
     by_path = read_files(tmp_path, "train.csv", "a/run.csv", "b/run.csv", split={"test_files": ["a/run.csv"]})
-    assert [e.name for e in by_path.test] == ["a/run:0"]
+    assert [e.name for e in by_path.test] == ["a-run:0"]
 
 
 @pytest.mark.parametrize(
