@@ -6,6 +6,8 @@ UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
 PYTHON ?= python3
 STAMP := $(VENV)/.installed
 WORKERS ?= 2
+# worlds whose effects no YAML of conf/ names
+EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-slow lint format bench lock data clean
@@ -47,7 +49,10 @@ lock: ## Write uv.lock against the public index only
 	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config
 
 data: install ## Make the measurements in data/ anew
-	rm -rf data/pendulum && $(BIN)/simpel simulate simulation=pendulum out=data/pendulum
+	rm -rf data/pendulum data/hidden_pendulum data/hidden_cart
+	$(BIN)/simpel simulate simulation=pendulum out=data/pendulum
+	$(BIN)/simpel simulate $(EXAM) sim=mujoco_pendulum simulation=hidden_pendulum out=data/hidden_pendulum
+	$(BIN)/simpel simulate $(EXAM) sim=mujoco_cart simulation=hidden_cart out=data/hidden_cart
 
 clean: ## Remove what make made
 	rm -rf $(VENV) .uv .pytest_cache .ruff_cache .mypy_cache .import_linter_cache dist build

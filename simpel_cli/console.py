@@ -1,17 +1,33 @@
 """What a person sees in the terminal: labelled lines, one progress bar, plain tables. Quiet when asked."""
 
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
 LOG = logging.getLogger("simpel")
+
+
+class _Screen(Console):
+    """A console whose reader may go away: `simpel fit | head` ends the printing, not the run."""
+
+    def on_broken_pipe(self) -> None:
+        """Print nothing from here on; Rich's own answer is to exit."""
+        self.quiet = True
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())  # what Python still holds back is flushed when the process ends
+        os.close(nowhere)
 
 
 class Terminal:
     """Labelled lines on standard output, kept in `run.log` as well.
+
+    A run does not depend on its output being read: where standard output is closed, the lines go to `run.log` alone.
 
     Args:
         quiet: print nothing.
@@ -19,10 +35,9 @@ class Terminal:
     """
 
     def __init__(self, quiet: bool, log: Path | None = None) -> None:
-        from rich.console import Console
-
         # a wide console when the output is a file or a pipe: lines are for grep, not for wrapping
-        self.console = Console(quiet=quiet, highlight=False, width=None if sys.stdout.isatty() else 240)
+        wide = sys.stdout is None or not sys.stdout.isatty()  # None: closed before the start (`simpel fit >&-`)
+        self.console = _Screen(quiet=quiet, highlight=False, width=240 if wide else None)
         LOG.setLevel(logging.INFO)
         LOG.propagate = False
         for handler in list(LOG.handlers):

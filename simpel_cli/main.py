@@ -163,7 +163,7 @@ def main() -> None:
         end = "" if message.endswith((".", "?")) else "."
         _fail(f"{message}{end} See `{_command_path(error)} --help`.", ConfigError.exit_code)
     except BrokenPipeError:
-        # the reader of our output went away (`simpel fit | head`): end quietly, as other tools do
+        # the reader of `--cfg` went away: end quietly, as other tools do (a run goes on, see `Terminal`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 

@@ -1,9 +1,8 @@
-"""Configuration: every YAML of conf/ composes and builds, lists what can be set, and `build` refuses what is wrong."""
+"""Configuration: every YAML of conf/ composes and builds and lists what can be set; words of the command line."""
 
 import dataclasses
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,9 @@ import yaml
 from command_line import ROOT, simpel
 
 from simpel_cli.commands.study import Evaluation
-from simpel_cli.config import build, checked, conf_dir, count_jobs
+from simpel_cli.config import checked, conf_dir, count_jobs
 from simpel_cli.data import Measurements
-from simpel_cli.errors import ConfigError
+from simpel_cli.nodes import build
 from simpel_cli.run import Settings
 from simulators.model import Model
 from simulators.worlds.simulate import Simulate
@@ -84,7 +83,7 @@ OWN_TO_THE_SYSTEM = {"Declared", "MujocoWorld", "CallableWorld", "Measurements"}
 )
 def test_leaves_list_every_field(path: Path) -> None:
     """What can be set stands in the YAML with its value: users read it there."""
-    from simpel_cli.config import _resolve
+    from simpel_cli.nodes import _resolve
 
     def check(node: Mapping, where: str) -> None:
         if "_target_" in node:
@@ -119,120 +118,6 @@ class TestValuesInYamlAreTheDefaults:
         node.pop("defaults", None)
         built = build(node, group)
         assert built == type(built)()
-
-
-# ---------------------------------------------------------------------------------------------------------- build()
-
-
-@dataclass(frozen=True)
-class Inner:
-    """A part.
-
-    Args:
-        width: of it, m.
-    """
-
-    width: float = 1.0
-
-
-@dataclass(frozen=True)
-class Outer:
-    """A whole.
-
-    Args:
-        count: how many,
-            over two lines.
-        sizes: one per layer.
-        inner: its part.
-        label: what to call it; null = nothing.
-    """
-
-    count: int
-    sizes: tuple[int, ...] = (1, 2)
-    inner: Inner = Inner()
-    label: str | None = None
-    table: dict[str, float] = dataclasses.field(default_factory=dict)
-    flag: bool = False
-
-    def __post_init__(self) -> None:
-        if self.count < 0:
-            raise ValueError("outer.count: negative")
-
-
-def make(**node: object) -> Outer:
-    return build(node, "outer", default=Outer)
-
-
-class TestBuild:
-    def test_nested_dataclasses_lists_and_numbers(self) -> None:
-        made = make(count=2, sizes=[3, 4], inner={"width": 2}, table={"a": 1}, label="x")
-        assert made == Outer(2, (3, 4), Inner(2.0), "x", {"a": 1.0})
-        assert isinstance(made.inner.width, float)
-        assert isinstance(made.table["a"], float)
-
-    def test_null_where_it_is_allowed(self) -> None:
-        assert make(count=1, label=None).label is None
-
-    @pytest.mark.parametrize(
-        ("node", "message"),
-        [
-            ({"cout": 1}, r"outer\.cout: no such key in Outer\. Did you mean outer\.count\?.*how many, over two lines"),
-            ({"zzz": 1}, r"outer\.zzz: no such key in Outer\. It has: count, sizes, inner, label, table, flag"),
-            ({}, r"outer\.count: missing\. \(count: int, how many, over two lines\.\)"),
-            ({"count": "a"}, r"outer\.count: got 'a'; expected an integer: how many"),
-            ({"count": True}, r"outer\.count: got True; expected an integer"),
-            ({"count": 1.0}, r"outer\.count: got 1\.0; expected an integer"),
-            ({"count": None}, r"outer\.count: got None; expected an integer"),
-            ({"count": 1, "sizes": 3}, r"outer\.sizes: got 3; expected a list of an integer: one per layer"),
-            ({"count": 1, "sizes": [1, "b"]}, r"outer\.sizes\[1\]: got 'b'; expected an integer"),
-            ({"count": 1, "inner": {"widht": 1}}, r"outer\.inner\.widht: .*Did you mean outer\.inner\.width\?"),
-            ({"count": 1, "inner": {"width": "w"}}, r"outer\.inner\.width: got 'w'; expected a number: of it, m"),
-            ({"count": 1, "inner": 3}, r"outer\.inner: got 3; expected a mapping of keys"),
-            ({"count": 1, "table": {"a": "b"}}, r"outer\.table\.a: got 'b'; expected a number"),
-            ({"count": 1, "table": [1]}, r"outer\.table: got \[1\]; expected a mapping"),
-            ({"count": 1, "label": 3}, r"outer\.label: got 3; expected text or null"),
-            ({"count": 1, "flag": "yes"}, r"outer\.flag: got 'yes'; expected true or false"),
-            ({"count": -1}, r"outer\.count: negative"),
-        ],
-    )
-    def test_messages(self, node: dict, message: str) -> None:
-        with pytest.raises(ConfigError, match=message):
-            make(**node)
-
-    def test_not_a_mapping(self) -> None:
-        with pytest.raises(ConfigError, match=r"outer: got \[1\]; expected a mapping"):
-            build([1], "outer", default=Outer)
-
-    @pytest.mark.parametrize(
-        "target",
-        [
-            "os.system",
-            "builtins.eval",
-            "pandas.read_pickle",
-            "subprocess.Popen",
-            "hydra.utils.instantiate",
-            "command_line.Result",
-        ],
-    )
-    def test_fence(self, target: str) -> None:
-        with pytest.raises(ConfigError, match=r"allowed are classes of simpel_cli, simulators\. .*run\.plugins="):
-            build({"_target_": target}, "x")
-
-    @pytest.mark.parametrize(
-        "target",
-        ["simpel_cli.config.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.run.os.system"],
-    )
-    def test_fence_holds_for_what_a_module_imports(self, target: str) -> None:
-        with pytest.raises(ConfigError, match=r"cannot import|is not a dataclass"):
-            build({"_target_": target}, "x")
-
-    def test_plugins_open_the_fence(self) -> None:
-        made = build({"_target_": f"{__name__}.Inner", "width": 3}, "x", (__name__,))
-        assert made.width == 3.0
-
-    def test_role_of_a_group(self) -> None:
-        with pytest.raises(ConfigError, match=r"sim\._target_: simpel_cli\.gp\.Matern32 is no sim"):
-            build({"_target_": "simpel_cli.gp.Matern32"}, "sim")
 
 
 class TestOverrides:

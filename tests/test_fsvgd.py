@@ -9,7 +9,7 @@ import optax
 import pytest
 from scipy.stats import skew
 
-from simpel_cli.methods.fsvgd import stein_velocity
+from simpel_cli.methods.fsvgd import distinct_rows, stein_velocity
 
 
 def test_two_particles_by_hand() -> None:
@@ -107,3 +107,22 @@ def test_median_bandwidth_puts_half_at_the_median_distance_on_every_scale(scale)
 def test_median_bandwidth_of_one_particle_follows_its_score():
     velocity, _ = stein_velocity(jnp.array([[0.3, -1.0]]), jnp.array([[1.0, 2.0]]), "median")
     np.testing.assert_allclose(velocity, [[1.0, 2.0]])
+
+
+@pytest.mark.parametrize(("size", "m"), [(3, 5), (4, 4), (1, 7), (8, 20)])
+def test_distinct_rows_are_distinct_and_uniform(size: int, m: int) -> None:
+    keys = jax.random.split(jax.random.key(0), 4000)
+    rows, counts = jax.vmap(lambda key: distinct_rows(key, size, jnp.asarray(m)))(keys)
+    rows = np.asarray(rows)
+    assert np.all(counts)
+    assert all(len(set(row)) == size for row in rows)
+    frequency = np.bincount(rows.ravel(), minlength=m) / len(rows)
+    assert frequency.shape == (m,)  # none beyond the last
+    np.testing.assert_allclose(frequency, size / m, atol=0.035)  # 4 standard errors of a fraction
+    together = np.mean([(0 in row) and (m - 1 in row) for row in rows])
+    np.testing.assert_allclose(together, size * (size - 1) / (m * (m - 1)), atol=0.035)
+
+
+def test_of_too_few_rows_each_counts_once() -> None:
+    rows, counts = distinct_rows(jax.random.key(0), 5, jnp.asarray(3))
+    assert np.asarray(rows)[np.asarray(counts)].tolist() == [0, 1, 2]

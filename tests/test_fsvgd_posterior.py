@@ -87,25 +87,23 @@ def fitted(method: FSVGD, at: np.ndarray = GRID, seeds: tuple[int, ...] = (0,)) 
     return Fitted(particles.mean(axis=1), particles.std(axis=1))
 
 
-def assert_close_to_exact(fit: Fitted, bar: float = 0.02) -> None:
-    """The bars of LEARNING.md at every point between the data, and on average everywhere."""
+def assert_close_to_exact(fit: Fitted, where: np.ndarray) -> None:
+    """The bars of LEARNING.md at every point of the grid that `where` marks."""
     mean, std = exact(GRID)
-    error, ratio = np.abs(fit.mean - mean), fit.std / std
-    assert error[:, INSIDE].max() < bar
-    assert error.mean(axis=1).max() < bar
-    assert ratio[:, INSIDE].min() > 0.8
-    assert ratio[:, INSIDE].max() < 1.05
-    assert ratio.mean(axis=1).min() > 0.8
-    assert ratio.mean(axis=1).max() < 1.05
+    error, ratio = np.abs(fit.mean - mean)[:, where], (fit.std / std)[:, where]
+    assert error.max() < 0.02
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.05
 
 
-def test_posterior_is_that_of_the_gaussian_process() -> None:
-    assert_close_to_exact(fitted(METHOD), 0.03)  # half of the steps, see below
+def test_posterior_between_the_data_is_that_of_the_gaussian_process() -> None:
+    assert_close_to_exact(fitted(METHOD), INSIDE)
 
 
 @pytest.mark.slow
-def test_posterior_is_that_of_the_gaussian_process_for_three_seeds() -> None:
-    assert_close_to_exact(fitted(dataclasses.replace(METHOD, steps=5000), seeds=(0, 1, 2)))
+def test_posterior_is_that_of_the_gaussian_process_everywhere_for_three_seeds() -> None:
+    # beyond the data the likelihood no longer pulls, and the means take four times as long to arrive
+    assert_close_to_exact(fitted(dataclasses.replace(METHOD, steps=10000), seeds=(0, 1, 2)), np.full(len(GRID), True))
 
 
 @pytest.fixture(scope="module")

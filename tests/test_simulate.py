@@ -183,6 +183,22 @@ def test_the_card_says_how_the_data_were_made_in_plain_yaml() -> None:
     assert "truth" not in Simulate(episodes=2, steps=5, hide_truth=True).run(decay()).card
 
 
+def test_what_is_not_measured_has_no_column_and_is_not_on_the_card() -> None:
+    everything = Simulate(episodes=2, steps=9, noise_std={"c": 0.1, "q": 0.2}).run(decay())
+    columns, card = Simulate(episodes=2, steps=9, noise_std={"c": 0.1, "q": 0.2}, unmeasured=("c",)).run(decay())
+    assert list(columns) == ["episode", "t", "u", "q", "split"]
+    np.testing.assert_array_equal(columns["q"], everything.columns["q"])
+    assert card["noise_std"] == {"q": 0.2}
+    assert card["initial"] == {}
+    assert list(card["columns"]) == ["t", "u", "q"]
+
+
+def test_the_card_begins_with_the_description_if_there_is_one() -> None:
+    card = Simulate(episodes=2, steps=5, description="A tank that drains.").run(decay()).card
+    assert next(iter(card.items())) == ("description", "A tank that drains.")
+    assert "description" not in Simulate(episodes=2, steps=5).run(decay()).card
+
+
 def test_a_world_is_simulated_and_its_gap_stands_out_of_the_noise() -> None:
     std = {"phi": 0.01, "omega": 0.05}
     truth = {"m": 1, "l": 1, "C_m": 1, "friction_loss": 0.2, "damping": 0.1, "drag": 0.5}
@@ -244,6 +260,14 @@ def test_a_multisine_has_its_frequencies_only_and_touches_the_range() -> None:
         (
             lambda: Simulate(noise_std={"cc": 1}).run(decay()),
             r"noise_std\.cc: .*known: c, q\. Did you mean c",
+        ),
+        (
+            lambda: Simulate(unmeasured=("cc",)).run(decay()),
+            r"simulation\.unmeasured\.cc: no such name; known: c, q\. Did you mean c",
+        ),
+        (
+            lambda: Simulate(unmeasured=("q", "c")).run(decay()),
+            r"simulation\.unmeasured: nothing of decay is left to measure",
         ),
         (lambda: Simulate(truth={"K": 1}).run(decay()), r"simulation\.truth\.K: no such name; known: k, b"),
         (lambda: Simulate(initial={"u": [0, 1]}).run(decay()), r"simulation\.initial\.u: no such name; known: c"),

@@ -94,6 +94,36 @@ def test_friction_is_a_constant_torque_against_the_motion(
     np.testing.assert_allclose(after, expected, atol=1e-6)
 
 
+def late(delay: float, **changes: Any) -> CompiledWorld:
+    return MujocoWorld(
+        **declaration(inputs={"u": {"unit": "V", "range": [-2.5, 2.5], "actuator": "motor", "delay": delay}}, **changes)
+    ).model()
+
+
+@pytest.mark.parametrize(("delay", "waiting"), [(0.016, 1), (0.05, 1), (0.076, 2), (0.1, 2)])
+def test_late_commands_act_when_they_arrive(delay: float, waiting: int) -> None:
+    """Against the textbook with the inputs switched at `delay` after the transition begins, past ones first."""
+    world = late(delay)
+    assert [q.name for q in world.states] == ["phi", "omega", *[f"u_{i + 1}" for i in range(waiting)]]
+    assert {(q.unit, q.low, q.high) for q in world.states[2:]} == {("V", -2.5, 2.5)}
+    inputs, past = 2.5 * np.sin(np.arange(20)), np.array([[1.5, -0.5], [0, 0], [2, 2], [-1, 1]])[:, :waiting]
+    paths = roll(world, np.column_stack([STARTS, past]), inputs, vector(SIZES[0]))
+    np.testing.assert_array_equal(paths[:, 3:, 2], np.tile(inputs[2:], (4, 1)))
+    given = np.column_stack(
+        [past[:, ::-1], np.tile(inputs, (4, 1))]
+    )  # one column per transition, `waiting` of them past
+    n, fine = world.dt / 0.002, np.arange(20 * 25)
+    arriving = given[:, ((fine + 0.5 - delay / 0.002) // n).astype(int) + waiting]
+    expected = [oracle(x, u, vector(SIZES[0]), 0.002)[::25] for x, u in zip(STARTS, arriving, strict=True)]
+    np.testing.assert_allclose(paths[:, :, :2], expected, atol=1e-6)
+
+
+def test_a_delay_of_nothing_is_none(world: CompiledWorld) -> None:
+    same = late(0)
+    assert same.states == world.states
+    np.testing.assert_array_equal(same.step(*queries(world, 9)), world.step(*queries(world, 9)))
+
+
 def test_friction_holds_the_pendulum_where_gravity_is_weaker(world: CompiledWorld) -> None:
     start = np.array([[0.015, 0.0]])  # gravity 0.147 N m
     held = roll(world, start, np.zeros(20), vector(SIZES[0], friction=0.2))[0, -1]
@@ -195,6 +225,11 @@ def _set(*path: str, to: Any) -> Callable[[dict[str, Any]], None]:
     return change
 
 
+def _clash(node: dict[str, Any]) -> None:
+    node["inputs"]["u"]["delay"] = 0.05
+    node["states"]["u_1"] = node["states"].pop("omega")
+
+
 @pytest.mark.parametrize(
     ("change", "fragment"),
     [
@@ -217,6 +252,13 @@ def _set(*path: str, to: Any) -> Callable[[dict[str, Any]], None]:
             r"inputs\.v\.actuator: motor is already driven",
         ),
         (_set("parameters", "m", to=TIMESTEP), r"sim\.parameters\.m\.field: option has no number 'timestep'"),
+        (_set("inputs", "u", "delay", to=-0.1), r"sim\.inputs\.u\.delay: -0\.1 is no delay; give 0 s or more"),
+        (_set("inputs", "u", "delay", to="fast"), r"sim\.inputs\.u\.delay: 'fast' is no delay"),
+        (
+            _set("inputs", "u", "delay", to=0.033),
+            r"u\.delay: 0\.033 s is no whole number of MuJoCo's time steps of 0\.0",
+        ),
+        (_clash, r"sim\.states\.u_1: so is a command on its way called"),
         (_set("inputs", "u", "actuator", to="moter"), r"sim\.inputs\.u\.actuator: .* Did you mean motor\?"),
         (
             _set("parameters", "m", to=1.0),

@@ -1,8 +1,12 @@
 """What a user can get wrong: the message names key or file, what was given, what is allowed and the cure; exit codes."""
 
 import io
+import json
 import os
+import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +14,7 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from command_line import CART, RIG, TINY, csv, process, rig, simpel, start, swing
+from command_line import CART, RIG, TINY, csv, environment, process, rig, simpel, start, swing
 
 OWN = ("fit", "--config-dir", "my", "sim=cart", "data=rig", *TINY)
 CONFIG, DATA, NUMERICS = 2, 3, 4
@@ -224,7 +228,7 @@ def test_gpu_where_there_is_none(tmp_path: Path) -> None:
     import jax
 
     if jax.default_backend() == "gpu":
-        pytest.skip("there is one")
+        pytest.skip("the refusal of run.device=gpu needs a machine where JAX sees no GPU; this one has one")
     result = simpel(tmp_path, "fit", "run.device=gpu", *TINY)
     assert result.code == CONFIG
     assert "run.device: got gpu; JAX sees cpu only. Use run.device=auto" in result.err
@@ -284,6 +288,16 @@ class TestOfARun:
         assert result.code == CONFIG
         assert "run.seeds: evaluate keeps the run's own value; it takes run.quiet, run.device, run.cache" in result.err
 
+    @pytest.mark.parametrize("word", ["data.n_train=5", "+data.path=other.csv"])
+    def test_evaluate_takes_no_key_of_data_alone(self, folder: Path, word: str) -> None:
+        result = simpel(folder, "evaluate", "run", word)
+        key = word.lstrip("+").partition("=")[0]
+        assert result.code == CONFIG
+        assert result.err.startswith(f"error: {key}: evaluate keeps the run's own data; for another {key} fit again. ")
+        assert "To judge on other measurements, name them: data=NAME." in result.err
+        assert "data=NAME and its keys, evaluation.horizon, run.quiet, run.device, run.cache)" in result.err
+        assert result.err.count("\n") == 1
+
     def test_evaluate_takes_no_method(self, folder: Path) -> None:
         result = simpel(folder, "evaluate", "run", "method.steps=3")
         assert result.code == CONFIG
@@ -342,10 +356,33 @@ def test_a_process_of_its_own_prints_one_line(tmp_path: Path) -> None:
     assert len(result.err.splitlines()) == 1
 
 
-def test_a_reader_that_goes_away_ends_it_quietly(tmp_path: Path) -> None:
-    with start(tmp_path, "fit", *TINY[:-1]) as child:
+def lines_of_a_run_that_is_done(directory: Path) -> list[str]:
+    """Return what `run.log` says after the time stamps, of a run that must be done."""
+    record = json.loads((directory / "manifest.json").read_text())
+    assert (record["status"], record["error"]) == ("done", None)
+    log = (directory / "run.log").read_text()
+    return [line[24:] for line in log.splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
+
+
+def test_a_run_goes_on_when_its_reader_goes_away(tmp_path: Path) -> None:
+    """`simpel fit | head -1`"""
+    with start(tmp_path, "fit", *TINY[:-1], "hydra.run.dir=run") as child:
         assert child.stdout is not None
         assert child.stderr is not None
-        child.stdout.readline()
+        assert child.stdout.readline().startswith("simpel fit")
         child.stdout.close()
         assert child.stderr.read() == ""
+    assert child.returncode == 0
+    lines = lines_of_a_run_that_is_done(tmp_path / "run")
+    assert [line.split()[0] for line in lines if line[0] != " "] == [
+        "simpel", "data", "simulator", "test", "(intervals:", "report", "next",
+    ]  # fmt: skip
+
+
+def test_a_run_without_standard_output(tmp_path: Path) -> None:
+    """`simpel fit >&-`"""
+    words = ["-m", "simpel_cli.main", "fit", *TINY[:-1], "hydra.run.dir=run"]
+    shell = ["sh", "-c", 'exec "$0" "$@" >&-', sys.executable, *words]
+    result = subprocess.run(shell, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert lines_of_a_run_that_is_done(tmp_path / "run")[-2].startswith("next ")

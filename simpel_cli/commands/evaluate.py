@@ -27,12 +27,19 @@ def evaluate(job: Job) -> None:
     trained = load(run / "config.yaml")
     own = resolved(job)
     config = trained | {name: (trained.get(name) or {}) | (own.get(name) or {}) for name in ("run", "evaluation")}
+    settings = ", ".join(f"run.{k}" for k in OWN_SETTINGS)
     for key in own.get("run") or {}:
         if key not in OWN_SETTINGS:
             raise ConfigError(
-                f"run.{key}: evaluate keeps the run's own value; it takes {', '.join(f'run.{k}' for k in OWN_SETTINGS)}."
+                f"run.{key}: evaluate keeps the run's own value; it takes {settings}."
                 + did_you_mean(key, list(OWN_SETTINGS))
             )
+    if own.get("data") and not own["choices"].get("data"):
+        key = next(iter(own["data"]))
+        raise ConfigError(
+            f"data.{key}: evaluate keeps the run's own data; for another data.{key} fit again. To judge on other "
+            f"measurements, name them: data=NAME. (evaluate takes data=NAME and its keys, evaluation.horizon, {settings})"
+        )
     directory = make_directory(job.directory)
     refuse_occupied(directory)
     write_text(directory / "config.yaml", dump(config | ({"judged_on": own["data"]} if own.get("data") else {})))

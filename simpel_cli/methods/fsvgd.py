@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, NoiseModel, Problem, Setting
@@ -63,7 +63,7 @@ class FSVGD:
         final_learning_rate: fraction of it that is left at the last step, along a cosine; 1 = constant. A constant rate
             leaves the particles jittering about the posterior, which the learned noise then takes for noise.
         weight_decay: of AdamW, on network weights only.
-        batch: training points per step, at most; drawn with replacement.
+        batch: training points per step, at most; drawn without replacement.
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
         bandwidth: s of the kernel on all function values of a step; or `median`: K = 1/2 at the median distance between
@@ -130,26 +130,28 @@ class FSVGD:
             scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
             return Draws(to_normalised.x(x), scaled)
 
-        def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Int[Array, " k"]]:
-            """Rows of the batch, and rows of the bank: the batch and distinct fresh points."""
+        def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Bool[Array, " b"], Int[Array, " k"]]:
+            """Rows of the batch, which of them are data, and rows of the bank: the batch and distinct fresh points."""
             key_batch, key_offset, key_stride = jax.random.split(key, 3)
-            batch = jax.random.randint(key_batch, (min(self.batch, n_rows),), 0, problem.m)
+            batch, is_data = distinct_rows(key_batch, min(self.batch, n_rows), problem.m)
             # an odd stride visits a power of two of rows without repeats: distinct points without a sort
-            offset = jax.random.randint(key_offset, (), 0, self.pool)
-            stride = 2 * jax.random.randint(key_stride, (), 0, max(self.pool // 2, 1)) + 1
-            fresh = n_rows + (offset + stride * jnp.arange(self.fresh_points)) % self.pool
-            return batch, jnp.concatenate([batch, fresh])
+            b, kind = batch.shape[0], batch.dtype
+            offset = jax.random.randint(key_offset, (), 0, self.pool, kind)
+            stride = 2 * jax.random.randint(key_stride, (), 0, max(self.pool // 2, 1), kind) + 1
+            fresh = n_rows + (offset + stride * jnp.arange(b + self.fresh_points, dtype=kind)) % self.pool
+            # fresh points fill the batch where there are fewer data than it has room for
+            return batch, is_data, fresh.at[:b].set(jnp.where(is_data, batch, fresh[:b]))
 
         def step(key: PRNGKeyArray, state: State, draws: Draws) -> tuple[State, Info]:
             key_points, key_gap = jax.random.split(key)
-            batch, rows = measurement_set(key_points)
-            b = batch.shape[0]
+            batch, is_data, rows = measurement_set(key_points)
+            b, counted = batch.shape[0], is_data.astype(dtype)
             x, y = draws.x[rows], problem.y[batch]
             h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
 
-            weight = problem.m.astype(dtype) / b
+            weight = problem.m.astype(dtype) / jnp.sum(counted)
             log_likelihood, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: _log_likelihood(h, noise_std(rho), y), argnums=(0, 1)
+                lambda h, rho: _log_likelihood(h, noise_std(rho), y, counted), argnums=(0, 1)
             )(h[:, :b], state.noise)
             score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
             score = score.at[:, :b].add(weight * score_data)
@@ -164,7 +166,7 @@ class FSVGD:
                 updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
             particles = optax.apply_updates(state.particles, updates[0])
             noise = state.noise + self.noise.rate * updates[1]
-            info = Info(-log_likelihood / (b * self.particles), noise_std(state.noise), mean_kernel)
+            info = Info(-log_likelihood / (jnp.sum(counted) * self.particles), noise_std(state.noise), mean_kernel)
             return State(particles, noise, opt_state), info
 
         def prior_score(
@@ -188,10 +190,32 @@ class FSVGD:
         return Inference(init, draw, step, predict, members)
 
 
-def _log_likelihood(h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"]) -> Float[Array, ""]:
-    """Sum over particles, points and outputs of log N(y; h, sigma^2), up to a constant."""
+def distinct_rows(key: PRNGKeyArray, size: int, m: Int[Array, ""]) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:
+    """Draw `size` distinct rows out of m, without a sort; of fewer rows than that, all of them once.
+
+    Returns:
+        Rows, and which of them count: where m < size, entry i is row i and counts if i < m.
+
+    Reference: Floyd's algorithm, in Bentley and Floyd (1987), A sample of brilliance.
+    """
+    entry = jnp.arange(size, dtype=m.dtype)
+    last = jnp.maximum(m - size, 0) + entry  # entry i is drawn from the rows up to this one
+    drawn = jax.random.randint(key, (size,), 0, last + 1, m.dtype)
+
+    def choose(i: Int[Array, ""], rows: Int[Array, " size"]) -> Int[Array, " size"]:
+        return rows.at[i].set(jnp.where(jnp.any(rows == drawn[i]), last[i], drawn[i]))
+
+    rows = jax.lax.fori_loop(0, size, choose, jnp.full(size, -1, m.dtype))
+    enough = m >= size
+    return jnp.where(enough, rows, entry), enough | (entry < m)
+
+
+def _log_likelihood(
+    h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"], counted: Float[Array, " b"]
+) -> Float[Array, ""]:
+    """Sum over particles, counted points and outputs of log N(y; h, sigma^2), up to a constant."""
     z = (y[None] - h) / sigma[None, None]
-    return jnp.sum(-0.5 * z * z - jnp.log(sigma)[None, None])
+    return jnp.sum((-0.5 * z * z - jnp.log(sigma)[None, None]) * counted[None, :, None])
 
 
 def stein_velocity(

@@ -1,7 +1,7 @@
 """A MuJoCo world that answers queries.
 
 A query compiles the XML with its own parameter values, so that everything that follows from them (inertia, reference
-poses) follows, sets the joints, holds the controls and lets MuJoCo run for dt.
+poses) follows, sets the joints, gives each actuator its command and lets MuJoCo run for dt.
 """
 
 from dataclasses import dataclass
@@ -36,6 +36,11 @@ class Setting(NamedTuple):
             getattr(self.element, self.field)[self.entry] = value
 
 
+def commands_on_their_way(delay: int, n_steps: int) -> int:
+    """Return how many past commands a delay of so many time steps keeps, with `n_steps` of them in a transition."""
+    return -(-delay // n_steps)
+
+
 @dataclass(frozen=True, eq=False)
 class CompiledWorld:
     """A MuJoCo world that answers queries; see `World`.
@@ -43,15 +48,16 @@ class CompiledWorld:
     Args:
         name: as declared.
         dt: duration of one transition, s.
-        states: ds of them.
+        states: ds of them; those of the joints, then the past commands that are still on their way to an actuator.
         inputs: du of them.
         params: dp of them.
         outputs: none.
         gap: expected error of one transition by state.
         spec: the editable XML.
         settings: what each parameter sets.
-        state_columns: where each state stands in MuJoCo's state [time, positions, velocities].
+        state_columns: where each state of a joint stands in MuJoCo's state [time, positions, velocities].
         controls: which actuator each input drives.
+        delays: by how many of MuJoCo's time steps each input arrives late.
         threads: threads that share the queries.
 
     """
@@ -67,6 +73,7 @@ class CompiledWorld:
     settings: tuple[Setting, ...]
     state_columns: tuple[int, ...]
     controls: tuple[int, ...]
+    delays: tuple[int, ...]
     threads: int = 1
 
     def step(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
@@ -93,9 +100,9 @@ class CompiledWorld:
         timestep = models[0].opt.timestep
         n_steps = round(self.dt / timestep)
         begin = np.zeros((len(states), 1 + len(self.state_columns)))
-        begin[:, self.state_columns] = states
-        control = np.zeros((len(states), 1, models[0].nu))
-        control[:, 0, self.controls] = inputs
+        begin[:, self.state_columns] = states[:, : len(self.state_columns)]
+        control = np.zeros((len(states), n_steps, models[0].nu))
+        control[:, :, self.controls], waiting = self._late(states[:, len(self.state_columns) :], inputs, n_steps)
         path, _ = mujoco.rollout.rollout(
             [models[i] for i in which],
             [mujoco.MjData(models[0]) for _ in range(self.threads)],
@@ -106,7 +113,19 @@ class CompiledWorld:
         end = path[:, -1]
         # after a warning MuJoCo resets the state and rollout stops: the clock tells
         complete = np.abs(end[:, :1] - self.dt) < timestep / 2
-        return np.where(complete, end[:, self.state_columns], np.nan)
+        return np.where(complete, np.column_stack([end[:, self.state_columns], waiting]), np.nan)
+
+    def _late(self, past: np.ndarray, inputs: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return what reaches the actuators at each time step, (n, n_steps, du), and the past commands afterwards."""
+        arriving = np.empty((len(inputs), n_steps, len(self.delays)))
+        waiting = []
+        for i, delay in enumerate(self.delays):
+            n_past = commands_on_their_way(delay, n_steps)
+            commands = np.column_stack([inputs[:, i], past[:, :n_past]])  # newest first, one per transition
+            past = past[:, n_past:]
+            arriving[:, :, i] = commands[:, -((np.arange(n_steps) - delay) // n_steps)]
+            waiting.append(commands[:, :n_past])
+        return arriving, np.column_stack([np.empty((len(inputs), 0)), *waiting])
 
     def _compile(self, values: np.ndarray) -> mujoco.MjModel:
         for setting, value in zip(self.settings, values, strict=True):

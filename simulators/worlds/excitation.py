@@ -109,4 +109,5 @@ class Multisine:
         phases = rng.uniform(0, 2 * np.pi, self.count)
         wave = np.sin(2 * np.pi * frequencies * dt * np.arange(n_steps)[:, None] + phases).sum(axis=1)
         middle, half = (quantity.high + quantity.low) / 2, (quantity.high - quantity.low) / 2
-        return middle + half * wave / np.abs(wave).max()
+        # rounding must not carry the peak out of the range
+        return np.clip(middle + half * wave / np.abs(wave).max(), quantity.low, quantity.high)

@@ -1,5 +1,6 @@
 """MuJoCo as a world, declared: which joints, actuators and fields of an XML are states, inputs and parameters."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from simulators.expression import did_you_mean
 from simulators.model import Declared, ModelError
-from simulators.worlds.compiled_world import CompiledWorld, Setting
+from simulators.worlds.compiled_world import CompiledWorld, Setting, commands_on_their_way
 
 FOLDER = Path(__file__).parent
 LISTS = {
@@ -24,7 +25,7 @@ LISTS = {
 # keys of a quantity that say where it is in the XML, needed and optional ones, and those that a model has as well
 PLACES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "states": (("joint", "of"), ()),
-    "inputs": (("actuator",), ()),
+    "inputs": (("actuator",), ("delay",)),
     "parameters": (("element", "field"), ("index",)),
 }
 MEANING = {
@@ -49,7 +50,8 @@ class MujocoWorld:
         threads: threads that share the queries; the results do not depend on it.
         states: name: {unit, range, periodic, joint: <name>, of: position|velocity}; every joint needs both, since a
             query must fix the whole state of the world.
-        inputs: name: {unit, range, actuator: <name>}; other actuators are at zero.
+        inputs: name: {unit, range, actuator: <name>, delay}; other actuators are at zero. A `delay`, s, a whole number
+            of MuJoCo's time steps, makes the commands late; those on their way are states, <input>_1 the newest.
         parameters: name: {unit, range, prior, element, field, index}, or `value` for `range`: known. `element` is a
             kind and a name, e.g. `joint hinge`, or `option`; `field` is an attribute of that element in mujoco.MjSpec,
             mostly named as in the XML; `index` counts from 0 in a field of several numbers.
@@ -75,6 +77,14 @@ class MujocoWorld:
 
         """
         nodes = {section: self._without_places(section) for section in PLACES}
+        spec = self._read()
+        delays = {name: _delay(f"sim.inputs.{name}.delay", node, spec) for name, node in self.inputs.items()}
+        for name, delay in delays.items():
+            for i in range(commands_on_their_way(delay, round(self.dt / spec.option.timestep))):
+                past = f"{name}_{i + 1}"
+                if past in nodes["states"]:
+                    raise ModelError(f"sim.states.{past}: so is a command on its way called; choose another name")
+                nodes["states"][past] = nodes["inputs"][name]
         # units, ranges, priors, names and gap obey the rules of a model: let it read them
         quantities = Declared(
             self.name,
@@ -87,7 +97,6 @@ class MujocoWorld:
         ).model()
         if not isinstance(self.threads, int) or self.threads < 1:
             raise ModelError(f"sim.threads: {self.threads!r} is not allowed; give a whole number, at least 1")
-        spec = self._read()
         settings = {name: _place(spec, f"sim.parameters.{name}", node) for name, node in self.parameters.items()}
         for name, value in quantities.fixed.items():
             settings[name].write(value)
@@ -103,6 +112,7 @@ class MujocoWorld:
             settings=tuple(settings[quantity.name] for quantity in quantities.params),
             state_columns=self._state_columns(spec),
             controls=self._controls(spec),
+            delays=tuple(delays.values()),
             threads=self.threads,
         )
         for name, setting in settings.items():
@@ -206,6 +216,20 @@ class MujocoWorld:
                 raise ModelError(f"{path}: {wanted} is already driven by the input {taken[wanted]}; leave one out")
             taken[wanted] = name
         return tuple(names.index(wanted) for wanted in taken)
+
+
+def _delay(path: str, node: Mapping[str, Any], spec: mujoco.MjSpec) -> int:
+    """Return by how many time steps an input is late."""
+    delay, timestep = node.get("delay", 0), spec.option.timestep
+    if not isinstance(delay, (int, float)) or isinstance(delay, bool) or not 0 <= delay < math.inf:
+        raise ModelError(f"{path}: {delay!r} is no delay; give 0 s or more")
+    steps = round(delay / timestep)
+    if abs(delay - steps * timestep) > 1e-9:
+        raise ModelError(
+            f"{path}: {delay:g} s is no whole number of MuJoCo's time steps of {timestep:g} s; "
+            "change it, or set sim.timestep"
+        )
+    return steps
 
 
 def _place(spec: mujoco.MjSpec, path: str, node: Mapping[str, Any]) -> Setting:

@@ -7,7 +7,7 @@ more noise leaves the motion.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -50,9 +50,11 @@ class Simulate:
         excitation: law of the inputs, each signal drawn on its own.
         initial: state -> [low, high] of its uniform initial value; left out: the declared range.
         noise_std: state or output -> standard deviation of the Gaussian noise on it, in its unit; 0 where left out.
+        unmeasured: states and outputs that get no column.
         truth: parameter -> value; those left out are drawn from their prior.
         test_fraction: the last episodes (static: rows), so large a fraction, get split = test; 0 = no column `split`.
         hide_truth: leave the parameter values out of the card.
+        description: a sentence for the card; empty = none.
 
     Raises:
         ModelError: a value that is not allowed; names `simulation.<key>`.
@@ -65,9 +67,11 @@ class Simulate:
     excitation: Excitation = field(default_factory=HeldRandom)
     initial: dict[str, Any] = field(default_factory=dict)
     noise_std: dict[str, float] = field(default_factory=dict)
+    unmeasured: tuple[str, ...] = ()
     truth: dict[str, float] = field(default_factory=dict)
     test_fraction: float = 0.25
     hide_truth: bool = False
+    description: str = ""
 
     def __post_init__(self) -> None:
         for key, least in (("episodes", 1), ("steps", 1), ("seed", 0)):
@@ -92,11 +96,16 @@ class Simulate:
                     f"simulation: {source.name} calls a quantity `{quantity.name}`, as one of the columns "
                     f"{', '.join(OWN_COLUMNS)} is called; choose another name"
                 )
-        _known("noise_std", self.noise_std, (*source.states, *source.outputs))
+        measurable = (*source.states, *source.outputs)
+        _known("noise_std", self.noise_std, measurable)
+        _known("unmeasured", self.unmeasured, measurable)
+        if {q.name for q in measurable} <= set(self.unmeasured):
+            raise ModelError(f"simulation.unmeasured: nothing of {source.name} is left to measure; leave one out")
         _known("truth", self.truth, source.params)
         _known("initial", self.initial, source.states)
         truth = self._truth(source)
         columns = self._trajectories(source, truth) if source.states else self._static(source, truth)
+        columns = {name: values for name, values in columns.items() if name not in self.unmeasured}
         if self.test_fraction:
             rows = np.arange(self.episodes * self.steps)
             columns["split"] = self._split(columns.get("episode", rows))
@@ -202,7 +211,9 @@ class Simulate:
         excitation = {"law": type(self.excitation).__name__}
         if dataclasses.is_dataclass(self.excitation):
             excitation |= dataclasses.asdict(self.excitation)
-        card: dict[str, Any] = {
+        measured = [q for q in (*source.states, *source.outputs) if q.name in columns]
+        card: dict[str, Any] = {"description": self.description} if self.description else {}
+        card |= {
             "source": source.name,
             "made_by": "simpel simulate",
             "licence": LICENCE,
@@ -211,17 +222,17 @@ class Simulate:
             "episodes": self.episodes,
             "steps": self.steps,
             "columns": {name: {"unit": units[name]} for name in columns if name in units},
-            "noise_std": {q.name: float(self.noise_std.get(q.name, 0)) for q in (*source.states, *source.outputs)},
+            "noise_std": {q.name: float(self.noise_std.get(q.name, 0)) for q in measured},
         }
         if source.states:
             card["excitation"] = excitation
-            card["initial"] = {q.name: list(self._initial_range(q)) for q in source.states}
+            card["initial"] = {q.name: list(self._initial_range(q)) for q in source.states if q in measured}
         if not self.hide_truth:
             card["truth"] = {q.name: float(value) for q, value in zip(source.params, truth, strict=True)}
         return card
 
 
-def _known(key: str, given: Mapping[str, Any], quantities: tuple[Quantity, ...]) -> None:
+def _known(key: str, given: Iterable[str], quantities: tuple[Quantity, ...]) -> None:
     names = [quantity.name for quantity in quantities]
     for name in given:
         if name not in names:

@@ -21,8 +21,9 @@ import yaml
 
 from simpel_cli import loop
 from simpel_cli.commands.study import STRETCH
-from simpel_cli.config import build, conf_dir
+from simpel_cli.config import conf_dir
 from simpel_cli.evaluation import Posterior, one_step
+from simpel_cli.nodes import build
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.problem import assemble, normaliser_of, system_of
 from simpel_cli.run import Settings, configure, stream

@@ -8,9 +8,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from simpel_cli.config import build
 from simpel_cli.data import Measurements, Recording, absolute, read, transitions
 from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.nodes import build
 from simulators.model import Declared
 
 DECAY = Declared(
@@ -58,7 +58,7 @@ def test_without_an_episode_column_a_file_is_an_episode(tmp_path: Path) -> None:
     write(tmp_path, "b/run.csv", 300)
     write(tmp_path, "c/last.csv", 500)
     recording = read_files(tmp_path, "a/run.csv", "b/run.csv", "c/last.csv", episode=None)
-    assert firsts(recording) == ({"a-run": 100, "b-run": 300}, {"c/last": 500})
+    assert firsts(recording) == ({"a-run": 100, "b-run": 300}, {"c-last": 500})
 
 
 def test_a_row_without_an_episode_is_still_dropped(tmp_path: Path) -> None:

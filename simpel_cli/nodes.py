@@ -1,0 +1,189 @@
+"""Config nodes to dataclasses: plain mappings in, objects out.
+
+A config node is `_target_:` plus the fields of one frozen dataclass; the dataclass is schema, defaults, documentation
+and validator. `_target_` reaches simpel_cli, simulators and the packages named in `run.plugins`, nothing else: a YAML
+file cannot call arbitrary code.
+"""
+
+import collections.abc
+import dataclasses
+import difflib
+import importlib
+import inspect
+import re
+import types
+import typing
+from typing import Any
+
+from simpel_cli.errors import ConfigError, did_you_mean
+
+OWN_PACKAGES = ("simpel_cli", "simulators")
+ROLES = {"sim": "model", "prior": "uses_simulator", "score": "closed_form_gap", "method": "bind"}
+
+
+def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type | None = None) -> Any:
+    """Build the dataclass that a config node declares.
+
+    Args:
+        node: mapping with `_target_` (or without, if `default` is given) and the dataclass's fields.
+        path: where the node stands, for messages, e.g. `method`.
+        plugins: further packages that `_target_` may name.
+        default: dataclass of a node without `_target_`.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type, a target outside the fence, or what the dataclass itself refuses.
+    """
+    if not isinstance(node, dict):
+        raise ConfigError(f"{path}: got {node!r}; expected a mapping of keys.")
+    fields = {str(k): v for k, v in node.items() if k != "_target_"}
+    target = node.get("_target_")
+    cls = _resolve(str(target), path, plugins) if target is not None else default
+    if cls is None:
+        raise ConfigError(f"{path}: the key _target_ is missing; it names the class, e.g. simulators.model.Declared.")
+    role = ROLES.get(path)
+    if role is not None and role not in {*dir(cls), *(f.name for f in dataclasses.fields(cls))}:
+        raise ConfigError(f"{path}._target_: {target} is no {path}; the options in conf/{path}/ show what is.")
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    hints = typing.get_type_hints(cls)
+    for key in fields:
+        if key not in known:
+            raise ConfigError(_unknown_key(path, key, cls, hints))
+    for name, field in known.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in fields:
+            raise ConfigError(f"{path}.{name}: missing. {_described(cls, name, hints)}")
+    values = {k: _convert(v, hints[k], f"{path}.{k}", plugins, cls) for k, v in fields.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:  # e.g. simulators.model.ModelError, which knows nothing of simpel_cli
+        raise ConfigError(str(error)) from error
+
+
+def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:
+    package = target.split(".")[0]
+    if package not in (*OWN_PACKAGES, *plugins):
+        raise ConfigError(
+            f"{path}._target_: got {target}; allowed are classes of {', '.join((*OWN_PACKAGES, *plugins))}. "
+            f"To use a package of your own, name it: 'run.plugins=[{package}]'."
+        )
+    module_name, _, name = target.rpartition(".")
+    if not module_name:
+        raise ConfigError(f"{path}._target_: got {target}; a class is named with its module, package.module.Class.")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(f"{path}._target_: cannot import {module_name} ({error}).") from error
+    cls = getattr(module, name, None)
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        public = [n for n, v in vars(module).items() if isinstance(v, type) and dataclasses.is_dataclass(v)]
+        raise ConfigError(
+            f"{path}._target_: {target} is not a dataclass.{did_you_mean(name, public)} "
+            f"({module_name} has: {', '.join(public) or 'none'})"
+        )
+    return cls
+
+
+def _function(name: str, path: str, plugins: tuple[str, ...]) -> Any:
+    """Import a function of a package that the user named in `run.plugins`."""
+    module_name, _, attribute = name.rpartition(".")
+    package = name.split(".")[0]
+    if package not in plugins or not module_name:
+        raise ConfigError(
+            f"{path}: got {name}; expected package.module.function of a package in run.plugins ({list(plugins)}). "
+            f"If you trust it: 'run.plugins=[{package}]'."
+        )
+    try:
+        found = getattr(importlib.import_module(module_name), attribute, None)
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: cannot import {module_name} ({error}). Install its package, or put its folder into PYTHONPATH."
+        ) from error
+    if not callable(found):
+        raise ConfigError(f"{path}: {module_name} has no function {attribute}.")
+    return found
+
+
+def _convert(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type) -> Any:
+    """Convert a YAML value to a field's type, or say what was expected."""
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) or _origin(hint) is typing.Union else (hint,)
+    if value is None and type(None) in options:
+        return None
+    for option in options:
+        converted = _as(value, option, path, plugins, owner)
+        if converted is not _NO:
+            return converted
+    expected = " or ".join(_type_name(o) for o in options)
+    doc = _field_docs(owner).get(path.rpartition(".")[2], "")
+    raise ConfigError(f"{path}: got {value!r}; expected {expected}{': ' + doc if doc else '.'}")
+
+
+_NO = object()
+
+
+def _as(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type) -> Any:
+    origin = _origin(hint)
+    if hint is Any:
+        return value
+    if origin is collections.abc.Callable:
+        return _function(value, path, plugins) if isinstance(value, str) else _NO
+    if hint is bool or hint is str:
+        return value if isinstance(value, hint) else _NO
+    if hint is int:
+        return value if isinstance(value, int) and not isinstance(value, bool) else _NO
+    if hint is float:
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else _NO
+    if origin in (tuple, list) and isinstance(value, list | tuple):
+        item = typing.get_args(hint)[0]
+        return origin(_convert(v, item, f"{path}[{i}]", plugins, owner) for i, v in enumerate(value))
+    if origin in (dict, collections.abc.Mapping) and isinstance(value, dict):
+        item = typing.get_args(hint)[1]
+        return {k: _convert(v, item, f"{path}.{k}", plugins, owner) for k, v in value.items()}
+    if isinstance(value, dict) and (dataclasses.is_dataclass(hint) or getattr(hint, "_is_protocol", False)):
+        default = hint if isinstance(hint, type) and dataclasses.is_dataclass(hint) else None
+        return build(value, path, plugins, default=default)
+    return _NO
+
+
+def _origin(hint: Any) -> Any:
+    return typing.get_origin(hint)
+
+
+def _type_name(hint: Any) -> str:
+    if hint is type(None):
+        return "null"
+    if _origin(hint) in (tuple, list):
+        return f"a list of {_type_name(typing.get_args(hint)[0])}"
+    if _origin(hint) in (dict, collections.abc.Mapping):
+        return "a mapping"
+    if dataclasses.is_dataclass(hint) or getattr(hint, "_is_protocol", False):
+        return "a mapping of keys"
+    return {int: "an integer", float: "a number", str: "text", bool: "true or false"}.get(hint, str(hint))
+
+
+def _field_docs(cls: type) -> dict[str, str]:
+    """First sentences of the `Args:` section of a dataclass's docstring."""
+    section = re.split(r"\n\s*Args:\n", inspect.getdoc(cls) or "", maxsplit=1)
+    if len(section) < 2:
+        return {}
+    docs = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", section[1], re.M)
+    return {name: re.sub(r"\s+", " ", text).strip() for name, text in docs}
+
+
+def _described(cls: type, name: str, hints: dict[str, Any]) -> str:
+    doc = _field_docs(cls).get(name, "")
+    return f"({name}: {getattr(hints[name], '__name__', str(hints[name]))}{', ' + doc if doc else ''})"
+
+
+def _unknown_key(path: str, key: str, cls: type, hints: dict[str, Any]) -> str:
+    names = [f.name for f in dataclasses.fields(cls)]
+    close = difflib.get_close_matches(key, names, n=1, cutoff=0.6)
+    if not close:
+        return f"{path}.{key}: no such key in {cls.__name__}. It has: {', '.join(names)}."
+    field = next(f for f in dataclasses.fields(cls) if f.name == close[0])
+    doc = _field_docs(cls).get(close[0], "")
+    kind = getattr(hints[close[0]], "__name__", str(hints[close[0]]))
+    value = f" = {field.default!r}" if field.default is not dataclasses.MISSING else ""
+    return (
+        f"{path}.{key}: no such key in {cls.__name__}. Did you mean {path}.{close[0]}?"
+        f"      ({close[0]}: {kind}{value}{', ' + doc if doc else ''})"
+    )
