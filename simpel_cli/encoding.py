@@ -58,6 +58,11 @@ class Encoding:
         units = [u for q in self.states for u in (["1", "1"] if q.periodic else [q.unit])]
         return (*units, *(q.unit for q in self.outputs))
 
+    @property
+    def y_kinds(self) -> tuple[str, ...]:
+        """What every target coordinate is: the `change` of a state in one step, or the `value` of an output."""
+        return ("change",) * self.dim_state + ("value",) * len(self.outputs)
+
     def _state_labels(self) -> list[str]:
         return [n for q in self.states for n in ([f"sin({q.name})", f"cos({q.name})"] if q.periodic else [q.name])]
 

@@ -28,6 +28,12 @@ class NumericsError(SimpelError):
     exit_code = 4
 
 
+class Inconclusive(SimpelError):  # noqa: N818 (an answer, not a fault)
+    """`discover --strict` with a verdict other than `effect`."""
+
+    exit_code = 5
+
+
 class Interrupted(SimpelError):  # noqa: N818 (a state that was saved, not a fault)
     """Ctrl-C or SIGTERM; the state is saved."""
 

@@ -87,7 +87,7 @@ def evaluate(
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
 ) -> None:
-    """Judge a fitted model on held-out or other measurements.
+    """Judge a fitted model on its held-out episodes, or on all of a new file.
 
     Examples:
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9
@@ -104,6 +104,27 @@ def evaluate(
     read_manifest(run_dir)
     quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")
     _launch("evaluate", task, [f"run_dir='{quoted}'", *(overrides or [])], config_dir, cfg)
+
+
+@app.command()
+def discover(
+    overrides: Overrides = None,
+    config_dir: ConfigDir = None,
+    cfg: Cfg = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 5 unless the verdict is `effect`.")] = False,
+) -> None:
+    """Find what the simulator leaves unexplained, name the cause, add it, and report the error before and after.
+
+    Examples:
+      simpel discover experiment=hidden_pendulum
+
+      simpel discover --config-dir my sim=rig data=rig effect=[viscous_friction,coulomb_friction,input_delay]
+    """
+    from functools import partial
+
+    from simpel_cli.commands.discover import discover as task
+
+    _launch("discover", partial(task, strict=strict), overrides, config_dir, cfg)
 
 
 @app.command()

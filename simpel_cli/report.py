@@ -24,7 +24,8 @@ pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color
 <h1>{{ title }}</h1><p class="lead">{{ lead }}</p>
 {% for table in tables %}<h2>{{ table.title }}</h2>
 {% if table.note %}<p>{{ table.note }}</p>{% endif %}
-<div class="scroll"><table><thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead><tbody>
+<div class="scroll"><table>
+{% if table.head %}<thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>
 {% for row in table.rows %}<tr>{% for cell in row %}<td{% if table.text %} class="text">{{ cell }}{% else %}>
 {% set parts = cell.split(" (") %}{{ parts[0] }}{% if parts[1] %}<br><span class="interval">({{ parts[1] }}</span>{% endif %}
 {% endif %}</td>{% endfor %}
@@ -39,15 +40,20 @@ pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color
 FIGURES = {
     "learning_curves": ("Training", "A loss that still falls asks for more steps (method.steps)."),
     "predictions": (
-        "One step ahead, against measurement",
-        "The dark band is the model's own uncertainty, the light band adds the learned noise: 95 % of points lie inside it "
-        "when the model is right about itself.",
+        "Prediction against measurement",
+        "The dark band is the model's own uncertainty, the light band (or bar) adds the learned noise: 95 % of points lie "
+        "inside it when the model is right about itself.",
     ),
     "calibration": ("Calibration", "Share of test targets inside the central region of a stated probability."),
     "free_run": (
         "Free run",
         "The model runs on its own predictions along the measured inputs. The claimed standard deviation is that "
         "between the particles, plus the noise of one measurement. An error well above it asks for a better simulator.",
+    ),
+    "free_run_example": (
+        "One free run",
+        "The one whose error is the median of all free runs of the first seed. The band is two claimed standard deviations "
+        "to either side: the model's own uncertainty, grown along the way, and the noise of one measurement.",
     ),
 }
 

@@ -147,16 +147,21 @@ class Manifest:
             "error": error,
             "seed": self.settings.seed,
             "seeds": self.settings.seeds,
-            "wall_seconds": round(time.monotonic() - self.started, 3),
+            "wall_seconds": round(self.wall_seconds, 3),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "git_commit": _git_commit(),
             "python": platform.python_version(),
             "platform": platform.platform(),
-            "versions": {name: _version(name) for name in PACKAGES},
+            "versions": versions(),
             "inputs_sha256": self.inputs,
             **self.facts,
         }
         write_text(self.directory / "manifest.json", json.dumps(record, indent=1, default=str))
+
+    @property
+    def wall_seconds(self) -> float:
+        """Time since the start."""
+        return time.monotonic() - self.started
 
     def add_inputs(self, files: "tuple[Path, ...]") -> None:
         """Record the SHA-256 of input files."""
@@ -233,6 +238,11 @@ def _command_line() -> str:
     """Return what was typed; while Hydra composes, the words stand behind the verb in place of the program."""
     words = [word.removeprefix("++") for word in sys.argv]
     return " ".join(["simpel", *(words if words and "/" not in words[0] else words[1:])])
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of the packages that numbers depend on; None: not installed as a package."""
+    return {name: _version(name) for name in PACKAGES}
 
 
 def _version(name: str) -> str | None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow.parquet as pq
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".pytest_cache" / "cache"  # compiled programs are shared by all tests and their processes
@@ -17,6 +18,7 @@ TINY = (
     "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64",
     "run.quiet=true",
 )  # fmt: skip
+FIT = ("fit", "experiment=pendulum", *TINY)
 
 CART = """\
 _target_: simulators.model.Declared
@@ -131,3 +133,10 @@ def rig(folder: Path, *, cart: str = CART, data: str = RIG, measurements: str | 
     if content != b"absent":
         (my / "run.csv").write_bytes(content)
     return my
+
+
+def rows(path: Path, *leave_out: str, split: str | None = None) -> list[dict[str, object]]:
+    """Metric rows, without the columns that name the run."""
+    table = pq.read_table(path / "metrics.parquet").to_pylist()
+    kept = [row for row in table if split is None or row["split"] == split]
+    return [{k: v for k, v in row.items() if k not in ("run", *leave_out)} for row in kept]

@@ -1,37 +1,28 @@
-"""The verbs from end to end, with tiny settings: files of the contract, repeatability, evaluation, sweeps, simulation."""
+"""The verbs from end to end, with tiny settings: files of the contract, repeatability, evaluation, simulation, words."""
 
 import json
-import os
 import re
-import signal
+import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from command_line import TINY, environment, process, rig, simpel, start
+from command_line import FIT, ROOT, TINY, csv, environment, rig, rows, simpel, swing
 from safetensors.numpy import load_file
 
 from simpel_cli.run import sha256
 
-FIT = ("fit", "experiment=pendulum", *TINY)
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),
     ("sim", pa.string()), ("data", pa.string()), ("n_train", pa.int32()), ("seed", pa.int32()), ("step", pa.int64()),
     ("split", pa.string()), ("metric", pa.string()), ("output", pa.string()), ("unit", pa.string()),
     ("value", pa.float64()),
 ]  # fmt: skip
-
-
-def rows(path: Path, *leave_out: str, split: str | None = None) -> list[dict[str, object]]:
-    """Metric rows, without the columns that name the run."""
-    table = pq.read_table(path / "metrics.parquet").to_pylist()
-    kept = [row for row in table if split is None or row["split"] == split]
-    return [{k: v for k, v in row.items() if k not in ("run", *leave_out)} for row in kept]
 
 
 def run(cwd: Path, *words: object) -> str:
@@ -53,12 +44,18 @@ class TestFit:
         names = {str(p.relative_to(fitted)) for p in fitted.rglob("*") if p.is_file()}
         expected = {
             "manifest.json", "config.yaml", "metrics.parquet", "predictions.parquet", "calibration.parquet",
-            "horizon.parquet", "checkpoint/state.safetensors", "run.log", "report.html", ".hydra/config.yaml",
-            ".hydra/overrides.yaml", ".hydra/hydra.yaml",
+            "horizon.parquet", "trajectories.parquet", "checkpoint/state.safetensors", "run.log", "report.html",
+            ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml",
         }  # fmt: skip
         assert expected <= names
         figures = {n for n in names if n.endswith(".png")}
-        assert {"learning_curves.png", "predictions.png", "calibration.png", "free_run.png"} <= figures
+        assert {
+            "learning_curves.png",
+            "predictions.png",
+            "calibration.png",
+            "free_run.png",
+            "free_run_example.png",
+        } <= figures
         assert names == expected | figures  # and nothing temporary
 
     def test_manifest(self, fitted: Path) -> None:
@@ -93,11 +90,47 @@ class TestFit:
         assert {row["metric"] for row in train} == {"loss", "mean_kernel", "noise_std"}
         test = [row for row in table if row["split"] == "test"]
         assert {row["step"] for row in test} == {100}
-        for metric in ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error"):
+        for metric in ("nll", "rmse", "nrmse", "mae", "crps", "coverage_90", "calibration_error"):
             of = [row["output"] for row in test if row["metric"] == metric]
             assert of == ["sin(phi)", "cos(phi)", "omega", "joint"]
             assert {row["output"] for row in test if row["metric"] == f"{metric}_low"} == set(of)
         assert {row["unit"] for row in test if row["metric"] == "rmse" and row["output"] == "omega"} == {"rad/s"}
+
+    def test_predictions_carry_the_users_episodes_and_times(self, fitted: Path) -> None:
+        found = pq.read_table(fitted / "predictions.parquet").to_pylist()
+        data = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pylist()
+        speed = {(str(row["episode"]), round(row["t"], 6)): row["omega"] for row in data if row["split"] == "test"}
+        assert {row["episode"] for row in found} == {episode for episode, _ in speed}
+        assert {row["segment"] for row in found} == {1}
+        for row in found:
+            if row["output"] == "omega":
+                now, then = (speed[row["episode"], round(row["time"] + dt, 6)] for dt in (0.0, 0.05))
+                assert row["measured"] == pytest.approx(then - now, abs=1e-9)
+
+    def test_free_runs_along_the_measurements(self, fitted: Path) -> None:
+        found = pq.read_table(fitted / "trajectories.parquet").to_pylist()
+        data = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pylist()
+        speed = {(str(row["episode"]), round(row["t"], 6)): row["omega"] for row in data}
+        assert {(row["output"], row["unit"]) for row in found} == {("phi", "rad"), ("omega", "rad/s")}
+        for row in found:
+            assert -1e-9 < row["time"] - row["start"] < 0.5 + 1e-9
+            assert row["std"] > 0
+            if row["output"] == "omega":
+                assert row["measured"] == pytest.approx(speed[row["episode"], round(row["time"], 6)], abs=1e-9)
+            else:
+                assert abs(row["mean"] - row["measured"]) < np.pi  # on the same turn
+            if row["time"] == row["start"]:
+                assert row["mean"] == pytest.approx(row["measured"], abs=1e-6)
+
+    def test_a_joint_error_of_mixed_units_is_kept_but_not_shown(self, fitted: Path) -> None:
+        joint = {row["metric"]: row for row in rows(fitted, split="test") if row["output"] == "joint"}
+        assert joint["rmse"]["unit"] == "mixed"  # rad/s, and none for sine and cosine
+        said = (fitted / "run.log").read_text()
+        (line,) = re.findall(r"^ +joint .*", said, re.M)
+        cells = re.split(r" {2,}", line.strip())
+        assert [cells[i] for i in (2, 4, 5)] == ["-"] * 3
+        assert cells[3].startswith(f"{joint['nrmse']['value']:.3g} (")
+        assert re.search(r"test \(3 episodes\) +NLL \S+ \(\S+\)   normalised RMSE \S+ \(\S+\)   coverage", said)
 
     def test_config_is_resolved_and_builds_again(self, fitted: Path) -> None:
         text = (fitted / "config.yaml").read_text()
@@ -119,6 +152,32 @@ class TestFit:
         assert not re.search(r"https?://|@import|url\(", page)
         assert "<script" not in page
         assert "simpel evaluate" in page
+
+    def test_report_says_how_the_result_came_about(self, fitted: Path) -> None:
+        record = json.loads((fitted / "manifest.json").read_text())
+        page = (fitted / "report.html").read_text()
+        table = page[page.index("<h2>Run</h2>") : page.index("<h2>Data checks</h2>")]
+        cells = re.findall(r"<td[^>]*>(.*?)</td>", table)
+        run_table = dict(zip(cells[::2], cells[1::2], strict=True))
+        assert run_table["training"] == "20 of 531 transitions"
+        assert run_table["seeds"] == "0"
+        said = re.search(r"kappa ([\d.e -]+)", (fitted / "run.log").read_text())
+        kappa = re.findall(r"(?:sin\(phi\)|cos\(phi\)|omega) ([\d.e-]+)", run_table["gap scale kappa"])
+        assert said is not None
+        assert [f"{float(k):.2g}" for k in kappa] == said[1].split()
+        # a free run starts from a measured state: no spread there but that of the noise
+        start = next(
+            row for row in pq.read_table(fitted / "trajectories.parquet").to_pylist()
+            if row["output"] == "omega" and row["time"] == row["start"]
+        )  # fmt: skip
+        assert f"omega {start['std']:.3g} rad/s" in run_table["learned noise"]
+        assert run_table["device"] == f"{record['device']}, float32"
+        assert f"training {record['train_seconds']:.1f} s" in run_table["time"]
+        seconds = re.search(r"([\d.]+) s in all", run_table["time"])
+        assert seconds is not None
+        assert record["train_seconds"] < float(seconds[1]) <= record["wall_seconds"] + 0.05
+        for name in ("simpel", "jax", "numpy"):
+            assert f"{name} {record['versions'][name]}" in run_table["software"]
 
     def test_same_seed_same_numbers(self, fitted: Path, tmp_path: Path) -> None:
         run(tmp_path, *FIT, "hydra.run.dir=again", "evaluation.horizon=0.5")
@@ -145,6 +204,19 @@ class TestFit:
         run(tmp_path, *FIT, "hydra.run.dir=run", "run.precision=float64")
         arrays = load_file(tmp_path / "run" / "checkpoint" / "state.safetensors")
         assert all(a.dtype == "float64" or a.dtype.kind == "i" for a in arrays.values())
+
+    def test_segments_of_an_episode_are_not_taken_for_episodes(self, tmp_path: Path) -> None:
+        """Every sixth row is lost, so that each of four episodes falls into twelve pieces."""
+        rig(tmp_path, measurements=csv([r for i, r in enumerate(swing(episodes=4, rows=72)) if i % 6 != 5]))
+        run(tmp_path, "fit", "--config-dir", "my", "sim=cart", "data=rig", *TINY, "hydra.run.dir=run")
+        said = (tmp_path / "run" / "run.log").read_text()
+        assert "3 train / 1 test episodes in 36 / 12 segments," in said
+        assert "test (1 episode in 12 segments)" in said
+        assert "resampling 4 windows of 1 s)" in said
+        found = pq.read_table(tmp_path / "run" / "predictions.parquet").to_pylist()
+        assert len({row["episode"] for row in found}) == 1
+        assert {row["segment"] for row in found} == set(range(1, 13))
+        assert all(row["time"] == pytest.approx(0.05 * (6 * (row["segment"] - 1) + row["row"])) for row in found)
 
 
 class TestEvaluate:
@@ -184,6 +256,31 @@ class TestEvaluate:
         assert nll[0] != nll[1]
         record = json.loads((tmp_path / "e" / "manifest.json").read_text())
         assert any("made" in path for path in record["inputs_sha256"])
+        judged = pq.read_table(tmp_path / "e" / "predictions.parquet").to_pylist()
+        assert len(judged) == 4 * 29 * 3  # every transition of every episode, whatever the file calls train or test
+        assert {row["episode"] for row in judged} == {"0", "1", "2", "3"}
+        said = (tmp_path / "e" / "run.log").read_text()
+        assert re.search(r"measurements.parquet   all of it, 4 episodes, new to the fit   checks \d+ ok", said)
+        assert "test (4 episodes)" in said
+        assert "the fit was not trained on this file" in (tmp_path / "e" / "report.html").read_text()
+
+    def test_one_new_episode(self, fitted: Path, tmp_path: Path) -> None:
+        table = pq.read_table(ROOT / "data" / "pendulum" / "measurements.parquet").to_pandas()
+        (tmp_path / "my" / "data").mkdir(parents=True)
+        table[table["episode"] == 0].drop(columns=["episode", "split"]).to_csv(tmp_path / "my" / "run.csv")
+        shutil.copy(ROOT / "data" / "pendulum" / "card.yaml", tmp_path / "my")  # the fit knows this one
+        (tmp_path / "my" / "data" / "one.yaml").write_text("path: ../run.csv\ntime: t\n")
+        run(tmp_path, "evaluate", fitted, "--config-dir", "my", "data=one", "hydra.run.dir=e", "run.quiet=true")
+        judged = pq.read_table(tmp_path / "e" / "predictions.parquet")
+        assert judged.num_rows == (len(table) // 12 - 2) * 3  # the one step across the cut is lost
+        assert "all of it, 1 episode in 2 segments, new to the fit" in (tmp_path / "e" / "run.log").read_text()
+
+    def test_the_files_own_training_data_are_not_judged(self, fitted: Path, tmp_path: Path) -> None:
+        words = ("data=pendulum", "data.split={test_fraction:0.9,by:episode}", "run.quiet=true")
+        run(tmp_path, "evaluate", fitted, *words, "hydra.run.dir=e")
+        assert rows(tmp_path / "e", "command") == rows(fitted, "command", split="test")
+        said = (tmp_path / "e" / "run.log").read_text()
+        assert "measurements.parquet   the test split of the fit, 3 episodes   checks" in said
 
 
 class TestSimulate:
@@ -219,71 +316,14 @@ class TestSimulate:
         assert {row["output"] for row in found if row["metric"] == "nll"} == {"f", "joint"}
         assert not [row for row in found if str(row["metric"]).startswith("free_run")]
         assert not (tmp_path / "f" / "horizon.parquet").exists()
-
-
-class TestSweep:
-    def test_a_job_that_fails_costs_itself_only(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=0,1", "hydra.sweep.dir=sweep")
-        result = process(tmp_path, "sweep", *words)
-        assert result.code == 2
-        assert "2 of 4 jobs failed, the others are collected" in result.err
-        assert "method.learning_rate: got -1.0; it must be positive" in result.err
-        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {(row["run"], row["seed"]) for row in table} == {
-            ("method.learning_rate=0.001 run.seed=0", 0),
-            ("method.learning_rate=0.001 run.seed=1", 1),
-        }
-        assert {row["split"] for row in table} == {"test"}
-        status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(4)]
-        assert status == ["done", "done", "failed", "failed"]
-        single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
-        assert single.code == 0
-        of_sweep = [r["value"] for r in table if r["seed"] == 1]
-        assert of_sweep == [r["value"] for r in rows(tmp_path / "single", split="test")]
-
-    def test_a_worker_that_is_killed_costs_one_job(self, tmp_path: Path) -> None:
-        """`fit -m` is the same as `sweep`."""
-        words = ("experiment=pendulum", *TINY, "run.seed=0,1,2", "hydra.sweep.dir=sweep")
-        with start(tmp_path, "fit", "-m", *words) as child:
-            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
-            os.kill(worker_of(child.pid), signal.SIGKILL)
-            _, err = child.communicate(timeout=240)
-        assert child.returncode == 1
-        assert "1 of 3 jobs failed" in err
-        assert "1: the worker process died (out of memory, or killed)" in err
-        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {row["seed"] for row in table} == {0, 2}
-
-    def test_ctrl_c_stops_it_and_keeps_what_is_done(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "run.seed=range(9)", "hydra.sweep.dir=sweep")
-        with start(tmp_path, "sweep", *words, start_new_session=True) as child:
-            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
-            os.killpg(child.pid, signal.SIGINT)  # as a terminal does
-            _, err = child.communicate(timeout=120)
-        assert child.returncode == 130
-        assert "stopped: the sweep was stopped; finished jobs are kept." in err
-        assert "Traceback" not in err
-        assert not (tmp_path / "sweep" / "3").exists()
-        assert 0 in {row["seed"] for row in pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()}
-
-
-def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not path.exists():
-        assert child.poll() is None, child.communicate()[1]
-        assert time.monotonic() < end, f"{path} did not appear"
-        time.sleep(0.02)
-
-
-def worker_of(parent: int) -> int:
-    """Return the process of a sweep that works (not multiprocessing's resource tracker)."""
-    children = Path(f"/proc/{parent}/task/{parent}/children")
-    if not children.exists():
-        pytest.skip("no /proc: cannot find the worker process")
-    for pid in children.read_text().split():
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            return int(pid)
-    raise AssertionError("no worker process")
+        said = (tmp_path / "f" / "run.log").read_text()
+        assert "30 train / 10 test rows, 30 rows used " in said
+        assert "test (10 rows)" in said
+        assert "resampling 10 rows)" in said
+        assert re.search(r"  value +NLL", said)
+        assert "one step" not in said.lower()
+        assert "one step" not in (tmp_path / "f" / "report.html").read_text().split("<h2>Go on")[0].lower()
+        assert set(pq.read_table(tmp_path / "f" / "predictions.parquet")["kind"].to_pylist()) == {"value"}
 
 
 class TestWords:

@@ -80,6 +80,8 @@ def test_static_function_has_no_state() -> None:
     static = Encoding((), (Quantity("x", "1", -5, 5),), (Quantity("f", "1", np.nan, np.nan),))
     x = static.to_x(np.zeros((3, 0)), np.ones((3, 1)))
     assert (static.dim_state, x.shape, static.y_names) == (0, (3, 1), ("f",))
+    assert static.y_kinds == ("value",)
+    assert ENCODING.y_kinds == ("change",) * 4 + ("value",)
     assert static.to_y(np.zeros((3, 0)), np.zeros((3, 0)), np.ones((3, 1))).shape == (3, 1)
 
 

@@ -32,6 +32,7 @@ N, DY = 3000, 2
 ENCODING = Encoding((Quantity("a", "m", -1, 1), Quantity("b", "s", -1, 1)), (Quantity("u", "V", -1, 1),))
 OUTPUTS = (*ENCODING.y_names, "joint")
 NOISE = np.array([0.2, 3.0])
+SPREAD = np.array([0.4, 1.5])  # of the targets
 
 
 def synthetic(claimed: float, particles: int = 20) -> Posterior:
@@ -57,8 +58,15 @@ def data() -> tuple[np.ndarray, np.ndarray]:
     return x, x[:, :DY] + NOISE * rng.normal(size=(N, DY))
 
 
+def rows_of(
+    posterior: Posterior, data: tuple[np.ndarray, np.ndarray], encoding: Encoding = ENCODING
+) -> list[dict[str, object]]:
+    blocks = blocks_of(np.arange(N) // 10, np.zeros(N), 1, "s")
+    return one_step_table(one_step(posterior, *data), blocks, encoding, SPREAD)
+
+
 def table(posterior: Posterior, data: tuple[np.ndarray, np.ndarray]) -> dict[tuple[str, str], float]:
-    rows = one_step_table(one_step(posterior, *data), blocks_of(np.arange(N) // 10, np.zeros(N, int), 1), ENCODING)
+    rows = rows_of(posterior, data)
     return {(str(r["metric"]), str(r["output"])): float(r["value"]) for r in rows}  # type: ignore[arg-type]
 
 
@@ -76,6 +84,21 @@ def test_calibrated_posterior(data: tuple[np.ndarray, np.ndarray]) -> None:
             assert t["crps", output] == pytest.approx(NOISE[i] / np.pi**0.5, rel=0.05)
     assert t["rmse", "joint"] == pytest.approx(np.hypot(*NOISE), rel=0.05)
     assert t["nll", "joint"] == pytest.approx(t["nll", "a"] + t["nll", "b"], abs=0.05)
+    # errors of half and of twice the spread, 0.2 m / 0.4 m and 3 s / 1.5 s
+    for output, expected in zip(OUTPUTS, (0.5, 2.0, (4.25 / 2) ** 0.5), strict=True):
+        assert t["nrmse", output] == pytest.approx(expected, rel=0.05)
+        assert t["nrmse_low", output] < t["nrmse", output] < t["nrmse_high", output]
+
+
+def test_joint_errors_have_a_unit_only_where_the_outputs_share_one(data: tuple[np.ndarray, np.ndarray]) -> None:
+    def units(encoding: Encoding) -> dict[object, object]:
+        return {r["metric"]: r["unit"] for r in rows_of(synthetic(1.0), data, encoding) if r["output"] == "joint"}
+
+    both_m = Encoding((Quantity("a", "m", -1, 1), Quantity("b", "m", -1, 1)), ENCODING.inputs)
+    for encoding, unit in ((ENCODING, "mixed"), (both_m, "m")):
+        found = units(encoding)
+        assert {found[m] for m in ("rmse", "mae", "crps", "rmse_low", "crps_high")} == {unit}
+        assert (found["nll"], found["nrmse"], found["coverage_90"]) == ("nat", "1", "1")
 
 
 @pytest.mark.parametrize(("claimed", "coverage"), [(0.5, 0.589), (2.0, 0.9990)])
@@ -118,7 +141,7 @@ def test_intervals_cover_the_mean_of_correlated_points_as_often_as_they_say() ->
     n_blocks, length, repeats = 40, 10, 300
     episode = np.repeat(np.arange(n_blocks), length)
     row = np.tile(np.arange(length), n_blocks)
-    by_block = blocks_of(episode, row, length)
+    by_block = blocks_of(episode, row, length, "rows")
     by_point = Blocks(np.arange(len(row)), "points")
     rng = np.random.default_rng(0)
     hits = np.zeros(2)
@@ -149,11 +172,19 @@ def test_statistic_is_of_the_mean() -> None:
 
 def test_blocks() -> None:
     row = np.tile(np.arange(25), 2)
-    few = blocks_of(np.repeat([3, 8], 25), row, 10)
+    few = blocks_of(np.repeat(["c", "a"], 25), row, 10, "rows")
     np.testing.assert_array_equal(np.bincount(few.of_point), [10, 10, 5] * 2)
-    assert few.kind == "blocks of 10 rows"
-    many = blocks_of(np.repeat(np.arange(12), 5), np.tile(np.arange(5), 12), 2)
-    assert (many.kind, len(np.unique(many.of_point))) == ("episodes", 12)
+    assert (few.kind, str(few)) == ("windows of 10 rows", "6 windows of 10 rows")
+    many = blocks_of(np.repeat(np.arange(12), 5), np.tile(np.arange(5), 12), 2, "rows")
+    assert (many.kind, str(many)) == ("episodes", "12 episodes")
+
+
+def test_windows_of_time_start_with_the_episode_and_do_not_see_rounding() -> None:
+    time = np.concatenate([7.3 + 0.1 * np.arange(40), 100.05 + 0.1 * np.arange(20)])
+    blocks = blocks_of(np.repeat(["a", "b"], [40, 20]), time, 1.0, "s")
+    np.testing.assert_array_equal(np.bincount(blocks.of_point), [10] * 6)
+    assert blocks.kind == "windows of 1 s"
+    assert "nothing" in str(blocks_of(np.repeat("a", 40), time[:40], 10.0, "s"))
 
 
 # Free runs
@@ -161,6 +192,7 @@ def test_blocks() -> None:
 
 PENDULUM = model("pendulum", m=0.8, l=1.2, C_m=1.0)
 HORIZON = 40
+ALONE = Blocks(np.arange(6), "runs")
 
 
 def episodes(stack: int, count: int = 2, length: int = 100) -> tuple[Episode, ...]:
@@ -210,7 +242,7 @@ def test_free_run_of_the_truth_has_no_error() -> None:
     # without spread, the noise is left; the variance of the angle is the sum of those of its pair
     np.testing.assert_allclose(run.std[..., 0], 0.005, rtol=1e-6)
     np.testing.assert_allclose(run.std[..., 1], 0.05, rtol=1e-6)
-    rows = {(r["metric"], r["output"]): r["value"] for r in free_run_table(run, encoding, 0.05)}
+    rows = {(r["metric"], r["output"]): r["value"] for r in free_run_table(run, ALONE, encoding, 0.05)}
     assert rows["free_run_rmse@2s", "phi"] == pytest.approx(0, abs=1e-9)
     assert {m for m, _ in rows} >= {"free_run_rmse@0.5s", "free_run_rmse@1s", "free_run_rmse@2s_high"}
 

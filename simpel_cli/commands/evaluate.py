@@ -1,24 +1,30 @@
 """`simpel evaluate RUN_DIR [data=...]`: rebuild a posterior from configuration and checkpoint, judge it."""
 
 from pathlib import Path
+from typing import Any
 
+from simpel_cli.commands.extent import extent_of_test
 from simpel_cli.commands.fit import checkpointed_state, refuse_changed_inputs
 from simpel_cli.commands.judge import judge
-from simpel_cli.commands.show import publish
-from simpel_cli.commands.study import open_study, posteriors, prepare, resolved, settings_of
+from simpel_cli.commands.run_table import run_table
+from simpel_cli.commands.show import describe_data, publish
+from simpel_cli.commands.study import Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
-from simpel_cli.errors import ConfigError, did_you_mean
+from simpel_cli.data import Check
+from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.records import write_metrics, write_text
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
+CARDS = (".yaml",)  # describe columns; one may lie beside several files
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit
 
 
 def evaluate(job: Job) -> None:
-    """Judge the run `run_dir` on its own test split, or on the measurements that `data=` names.
+    """Judge the run `run_dir` on its own test split, or on all of the measurements that `data=` names.
 
-    Training data, seeds and method are the run's; `data=`, `evaluation=` and `run.quiet` may differ.
+    Of a file that the run was trained on, only its own test split is judged. Training data, seeds and method are the
+    run's; `data=`, `evaluation=` and `run.quiet` may differ.
     """
     run = Path(job.config["run_dir"])
     record = read_manifest(run)
@@ -48,22 +54,47 @@ def evaluate(job: Job) -> None:
         refuse_changed_inputs(record, study.recording.files)
         fitted = prepare(study)
         step, state, fitted = checkpointed_state(run, fitted)
-        judged_on = study
-        if own.get("data"):
-            choices = trained["choices"] | {"data": own["choices"].get("data", "")}
-            judged_on = open_study(
-                config | {"data": own["data"] | {"n_train": None}, "choices": choices}, job.data_folder
-            )
-            if judged_on.system.encoding != study.system.encoding:
-                raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
-            if sha256(judged_on.recording.files[0]) in (record.get("inputs_sha256") or {}).values():
-                # the run's own file: another split of it would judge the model on what it was trained on
-                judged_on = study
+        judged_on = _new_measurements(study, config, own, job, record) if own.get("data") else study
         manifest.add_inputs(judged_on.recording.files)
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")
-        terminal.line(f"simpel evaluate · {run} · step {step} · {judged_on.recording.files[0]}", style="bold")
-        judged = judge(judged_on, posteriors(study, fitted, state), directory, step)
+        terminal.line(f"simpel evaluate · {run} · step {step}", style="bold")
+        extent = extent_of_test(judged_on.recording)
+        what = f"the test split of the fit, {extent}" if judged_on is study else f"all of it, {extent}, new to the fit"
+        describe_data(terminal, judged_on.recording, what)
+        judged = judge(judged_on, posteriors(study, fitted, state), fitted.target_std, directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
         write_metrics(directory / "metrics.parquet", judged.rows, constants | {"n_train": len(fitted.training[0][0])})
-        publish(terminal, judged_on, judged, directory, dump(config), "evaluate", run)
+        table = run_table(study, fitted, judged, manifest)
+        publish(terminal, judged_on, judged, directory, dump(config), "evaluate", table, run)
+
+
+def _new_measurements(
+    study: Study, config: dict[str, Any], own: dict[str, Any], job: Job, record: dict[str, Any]
+) -> Study:
+    """Return the study with other measurements, all of them to be tested on; the run's own where the file is its own.
+
+    Raises:
+        ConfigError: other quantities were measured.
+    """
+    choices = config["choices"] | {"data": own["choices"].get("data", "")}
+    other = _opened_whole(config | {"choices": choices}, own["data"], job.data_folder)
+    if other.system.encoding != study.system.encoding:
+        raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
+    recording = other.recording
+    known = (record.get("inputs_sha256") or {}).values()
+    if any(sha256(file) in known for file in recording.files if file.suffix not in CARDS):
+        return study  # another split of the run's own file would judge the model on what it was trained on
+    recording = recording._replace(train=(), test=(*recording.train, *recording.test))
+    said = f"everything is judged ({extent_of_test(recording)}): the fit was not trained on this file"
+    checks = tuple(Check("split", True, said) if check.name == "split" else check for check in recording.checks)
+    return other._replace(recording=recording._replace(checks=checks))
+
+
+def _opened_whole(config: dict[str, Any], data: dict[str, Any], folder: Path) -> Study:
+    """Read measurements whose split does not matter; a file of one episode can be split within it only."""
+    whole = data | {"n_train": None, "n_episodes": None}
+    try:
+        return open_study(config | {"data": whole | {"split": {"by": "episode"}}}, folder)
+    except DataError:
+        return open_study(config | {"data": whole | {"split": {"by": "time", "test_fraction": 0.5}}}, folder)

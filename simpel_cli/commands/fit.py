@@ -9,6 +9,7 @@ import numpy as np
 
 from simpel_cli import loop
 from simpel_cli.commands.judge import Judged, judge
+from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
@@ -66,10 +67,12 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
             "train_seconds": round(time.perf_counter() - began, 3),
             "n_train": len(fitted.training[0][0]),
         }
-        judged: Judged = judge(study, posteriors(study, fitted, state), directory, study.method.steps)
+        found = posteriors(study, fitted, state)
+        judged: Judged = judge(study, found, fitted.target_std, directory, study.method.steps)
         metrics.add(judged.rows)
         metrics.close()
-    publish(terminal, study, judged, directory, dump(config), "fit")
+    table = run_table(study, fitted, judged, manifest)
+    publish(terminal, study, judged, directory, dump(config), "fit", table)
 
 
 def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> None:

@@ -1,5 +1,6 @@
 """Judge posteriors on held-out episodes and write what people look at: Parquet, figures, report."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -7,8 +8,11 @@ import numpy as np
 
 from simpel_cli import evaluation as ev
 from simpel_cli.commands.study import Study
-from simpel_cli.data import transitions
+from simpel_cli.data import Episode, Places, origins, places, transitions
+from simpel_cli.encoding import Encoding
 from simpel_cli.records import write_table
+
+MOST_RUNS = 100  # free runs whose course is kept
 
 
 class Judged(NamedTuple):
@@ -17,59 +21,97 @@ class Judged(NamedTuple):
     rows: list[dict[str, Any]]  # metric rows of all seeds
     blocks: str
     horizon: float | None  # s, of the free runs; None: no episode is long enough
+    noise_std: np.ndarray  # learned, per seed and target, (seeds, dy), data units
 
 
-def judge(study: Study, posteriors: list[ev.Posterior], directory: Path, step: int) -> Judged:
+def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, directory: Path, step: int) -> Judged:
     """Evaluate the posterior of every seed on the test split.
 
-    Writes `predictions.parquet`, `calibration.parquet` and `horizon.parquet` into `directory`.
+    Writes `predictions.parquet`, `calibration.parquet`, `horizon.parquet` and `trajectories.parquet` into `directory`.
+
+    Args:
+        study: what was fitted, with the measurements to judge it on.
+        posteriors: one per seed.
+        target_std: spread of the targets over the simulator's ranges, data units, shape (dy,).
+        directory: of the run.
+        step: that the posteriors are of.
     """
     encoding, dt = study.system.encoding, study.system.source.dt
     horizon = study.evaluation.steps(dt)
     episodes = study.recording.test
     pairs = transitions(episodes, encoding.stack)
     x, y = ev.test_arrays(pairs, encoding)
-    blocks = ev.blocks_of(pairs.episode, pairs.row, horizon)
+    where = _places(study, episodes, pairs.episode, pairs.row)
+    blocks = _blocks(study, episodes, where, horizon)
     follow = tuple(e for e in episodes if e.next_states is None)
     # the longest roll-out that an episode has room for
     horizon = min(horizon, max((len(e.states) - 1 - encoding.stack for e in follow), default=0))
-    tables: dict[str, list[dict[str, np.ndarray]]] = {"predictions": [], "calibration": [], "horizon": []}
+    tables: dict[str, list[dict[str, np.ndarray]]] = {
+        "predictions": [],
+        "calibration": [],
+        "horizon": [],
+        "trajectories": [],
+    }
     rows: list[dict[str, Any]] = []
     run = None
     for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
         result = ev.one_step(posterior, x, y)
-        found = ev.one_step_table(result, blocks, encoding)
-        tables["predictions"].append(_predictions(seed, pairs, y, result, encoding, dt))
+        found = ev.one_step_table(result, blocks, encoding, target_std)
+        tables["predictions"].append(_predictions(seed, where, y, result, encoding))
         tables["calibration"].append(_calibration(seed, result, encoding))
         run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None
         if run is not None:
-            found += ev.free_run_table(run, encoding, dt)
+            starts = _places(study, follow, run.episode, run.row)
+            found += ev.free_run_table(run, _blocks(study, follow, starts, horizon), encoding, dt)
             tables["horizon"].append(_horizon(seed, run, encoding, dt))
+            tables["trajectories"].append(_trajectories(seed, run, study, follow))
         rows += [{"seed": seed, "step": step, "split": "test", **row} for row in found]
     for name, parts in tables.items():
         if parts:
             write_table(directory / f"{name}.parquet", {k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
-    return Judged(rows, blocks.kind, horizon * dt if run is not None else None)
+    noise_std = np.stack([ev.noise_of(posterior, encoding) for posterior in posteriors])
+    return Judged(rows, str(blocks), horizon * dt if run is not None else None, noise_std)
+
+
+def _places(study: Study, episodes: Sequence[Episode], index: np.ndarray, row: np.ndarray) -> Places:
+    """Where rows of test episodes come from."""
+    of = origins((*study.recording.train, *study.recording.test))
+    return places(episodes, of, index, row)
+
+
+def _blocks(study: Study, episodes: Sequence[Episode], where: Places, horizon: int) -> ev.Blocks:
+    """What the bootstrap resamples: single rows where they stand alone, else episodes, or windows of the horizon."""
+    encoding, dt = study.system.encoding, study.system.source.dt
+    if not encoding.states and not encoding.stack and len(set(where.episode)) < ev.MIN_EPISODES:
+        return ev.Blocks(np.arange(len(where.row)), "rows")
+    if any(episode.next_states is not None for episode in episodes):
+        return ev.blocks_of(where.episode, where.row, horizon, "rows")  # their time may be unknown
+    return ev.blocks_of(where.episode, where.time, horizon * dt, "s")
 
 
 def _predictions(
-    seed: int, pairs: Any, y: np.ndarray, result: ev.OneStep, encoding: Any, dt: float
+    seed: int, where: Places, y: np.ndarray, result: ev.OneStep, encoding: Encoding
 ) -> dict[str, np.ndarray]:
-    """One row per test transition and output: measured and predicted target with its bands."""
+    """One row per test transition and output: measured and predicted target with its bands.
+
+    `episode` is the user's name; `segment` counts the pieces that checks or splits cut it into, `row` the rows of the
+    piece; `time` is that of the measurement that the step starts from; `kind` is `change` in one step or `value`.
+    """
     n, dy = y.shape
-    columns = {
+    return {
         "seed": np.full(n * dy, seed),
-        "episode": np.repeat(pairs.episode, dy),
-        "row": np.repeat(pairs.row, dy),
-        "time": np.repeat(pairs.row * dt, dy),
+        "episode": np.repeat(where.episode, dy),
+        "segment": np.repeat(where.segment, dy),
+        "row": np.repeat(where.row, dy),
+        "time": np.repeat(where.time, dy),
         "output": np.tile(encoding.y_names, n),
+        "kind": np.tile(encoding.y_kinds, n),
         "unit": np.tile(encoding.y_units, n),
         "measured": y.ravel(),
         "mean": result.mean.ravel(),
         "std": result.std.ravel(),
         "epistemic_std": result.epistemic_std.ravel(),
     }
-    return columns
 
 
 def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.ndarray]:
@@ -96,4 +138,28 @@ def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, 
         "unit": np.tile([q.unit for q in encoding.states], steps),
         "rmse": rmse.ravel(),
         "claimed_std": claimed.ravel(),
+    }
+
+
+def _trajectories(seed: int, run: ev.FreeRun, study: Study, episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+    """Measured and predicted course of free runs, at most `MOST_RUNS` of them, spread evenly over the test data.
+
+    An angle's prediction is written on the turn of the measured one.
+    """
+    count, length, ds = run.error.shape
+    kept = np.unique(np.linspace(0, count - 1, min(count, MOST_RUNS)).astype(int))
+    rows = run.row[kept, None] + np.arange(length)
+    where = _places(study, episodes, np.repeat(run.episode[kept], length), rows.ravel())
+    states, n = study.system.encoding.states, len(kept) * length
+    return {
+        "seed": np.full(n * ds, seed),
+        "episode": np.repeat(where.episode, ds),
+        "segment": np.repeat(where.segment, ds),
+        "start": np.repeat(where.time.reshape(-1, length)[:, 0], length * ds),
+        "time": np.repeat(where.time, ds),
+        "output": np.tile([q.name for q in states], n),
+        "unit": np.tile([q.unit for q in states], n),
+        "measured": run.measured[kept].ravel(),
+        "mean": (run.measured + run.error)[kept].ravel(),
+        "std": run.std[kept].ravel(),
     }

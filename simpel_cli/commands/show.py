@@ -5,14 +5,29 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
+from simpel_cli.data import Recording
+from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.plots import draw_run
 from simpel_cli.report import write_report
 
-HEAD = ("NLL", "RMSE", "MAE", "CRPS", "coverage of 90 %", "calibration error")
-METRICS = ("nll", "rmse", "mae", "crps", "coverage_90", "calibration_error")
+METRICS = {
+    "nll": "NLL",
+    "rmse": "RMSE",
+    "nrmse": "normalised RMSE",
+    "mae": "MAE",
+    "crps": "CRPS",
+    "coverage_90": "coverage of 90 %",
+    "calibration_error": "calibration error",
+}
+
+NOTE = (
+    "Normalised RMSE is in units of the simulator's own spread of the target over its declared ranges; jointly, the root "
+    "mean square over outputs. Joint errors in data units are shown where all outputs share a unit."
+)
 
 
 def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
@@ -24,20 +39,30 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
         f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}",
         style="bold",
     )
+    describe_data(terminal, recording, f"{extent_of_split(recording)}, {_used(study, fitted)}")
+    uncertain = " ".join(q.name for q in source.params) or "nothing"
+    kind = "" if study.system.transition is not None else " (queried)"
+    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+
+
+def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
+    """Say which file was read, what of it is used, and what to look at."""
     failed = [c for c in recording.checks if not c.ok]
     terminal.line(
-        f"{recording.files[0]}   {len(recording.train)} train / {len(recording.test)} test episodes, "
-        f"{len(fitted.training[0][0])} transitions used, dt {source.dt:g} s   "
-        f"checks {len(recording.checks) - len(failed)} ok" + (f", {len(failed)} to look at" if failed else ""),
+        f"{recording.files[0]}   {used}   checks {len(recording.checks) - len(failed)} ok"
+        + (f", {len(failed)} to look at" if failed else ""),
         "data",
     )
     for check in failed:
         terminal.line(f"{check.name}: {check.detail}", "", style="yellow")
     if recording.estimated:
         terminal.line(f"not measured, estimated from the position: {', '.join(recording.estimated)}", "")
-    uncertain = " ".join(q.name for q in source.params) or "nothing"
-    kind = "" if study.system.transition is not None else " (queried)"
-    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+
+
+def _used(study: Study, fitted: Fitted) -> str:
+    """What was trained on; a simulator without states has no step, hence no dt."""
+    used, source = len(fitted.training[0][0]), study.system.source
+    return f"{used} transitions used, dt {source.dt:g} s" if source.states else f"{used} rows used"
 
 
 def _gap_text(study: Study, fitted: Fitted) -> str:
@@ -58,17 +83,25 @@ def publish(
     directory: Path,
     config: str,
     command: str,
+    run: dict[str, Any],
     source: Path | None = None,
 ) -> None:
-    """Print the test results, draw the figures, write the report, and say where things lie and what to type next."""
+    """Print the test results, draw the figures, write the report, and say where things lie and what to type next.
+
+    Args:
+        terminal: to print to.
+        study: what was judged, on its measurements.
+        judged: the results.
+        directory: of the run.
+        config: the resolved configuration, as text.
+        command: verb.
+        run: table of how the results came about.
+        source: directory of the fit that was evaluated.
+    """
     values = _by_metric(judged.rows)
-    n_test = len(study.recording.test)
+    extent = extent_of_test(study.recording)
     terminal.line()
-    nll, rmse, crps, inside = (values[m, "joint"] for m in ("nll", "rmse", "crps", "coverage_90"))
-    head = f"test ({n_test} episode{'s' if n_test > 1 else ''})"
-    terminal.line(
-        f"{head:<20}NLL {_shown(nll)}   RMSE {_shown(rmse)}   CRPS {_shown(crps)}   coverage of 90 %: {100 * inside[0]:.0f} %"
-    )
+    terminal.line(f"{f'test ({extent})':<20}{_headline(study, values)}")
     table = _table(study, values)
     terminal.line(_aligned(table["head"], table["rows"]))
     free = _free_run_table(study, values)
@@ -78,7 +111,8 @@ def publish(
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
     next_commands = _next(study, directory, source)
     figures = draw_run(directory)
-    tables = [table | {"title": "One step ahead, held-out episodes"}]
+    what = "One step ahead" if study.system.encoding.states else "Predictions"
+    tables = [table | {"title": f"{what}, held-out data", "note": NOTE}]
     if free is not None:
         tables.append(free | {"title": "Free run, root mean square error"})
     checks = {
@@ -91,9 +125,9 @@ def publish(
     report = write_report(
         directory / "report.html",
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
-        lead=f"{study.system.source.name} on {study.recording.files[0].name}, {n_test} test episodes, seeds {s.all_seeds}. "
+        lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
-        tables=[*tables, checks],
+        tables=[*tables, run, checks],
         figures=figures,
         commands=next_commands,
         config=config,
@@ -129,13 +163,34 @@ def _shown(estimate: tuple[float, float, float]) -> str:
     return f"{value:.3g} ({low:.3g}..{high:.3g})"
 
 
+def _headline(study: Study, values: Values) -> str:
+    """Joint results: errors in the outputs' common unit, or normalised where they have none in common."""
+    unit = joint_unit(study.system.encoding)
+    errors = ("nrmse",) if unit == MIXED else ("rmse", "crps")
+    shown = [f"NLL {_shown(values['nll', 'joint'])}"]
+    shown += [f"{_named(METRICS[m], '' if m == 'nrmse' else unit)} {_shown(values[m, 'joint'])}" for m in errors]
+    return "   ".join([*shown, f"coverage of 90 %: {100 * values['coverage_90', 'joint'][0]:.0f} %"])
+
+
 def _table(study: Study, values: Values) -> dict[str, Any]:
     encoding = study.system.encoding
-    names = [*zip(encoding.y_names, encoding.y_units, strict=True), ("joint", "1")]
-    rows = []
-    for name, unit in names:
-        rows.append((_named(name, unit), *(_shown(values[m, name]) for m in METRICS)))
-    return {"head": ("change in one step", *HEAD), "rows": rows}
+    kinds = set(encoding.y_kinds)
+    mixed = len(kinds) > 1
+    names = [
+        _named(f"change of {name}" if mixed and kind == "change" else name, unit)
+        for name, unit, kind in zip(encoding.y_names, encoding.y_units, encoding.y_kinds, strict=True)
+    ]
+    rows = [
+        (shown, *(_shown(values[m, name]) for m in METRICS))
+        for shown, name in zip(names, encoding.y_names, strict=True)
+    ]
+    unit = joint_unit(encoding)
+    # a sum over outputs of different units is kept in metrics.parquet, labelled as such; shown, it would mislead
+    hidden = IN_DATA_UNITS if unit == MIXED else ()
+    joint = ("-" if m in hidden else _shown(values[m, "joint"]) for m in METRICS)
+    rows.append((_named("joint", "" if unit == MIXED else unit), *joint))
+    head = "one step" if mixed else {"change": "change in one step", "value": "value"}[kinds.pop()]
+    return {"head": (head, *METRICS.values()), "rows": rows}
 
 
 def _named(name: str, unit: str) -> str:
@@ -174,6 +229,6 @@ def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {source or directory}          # with data=NAME: on other measurements",
+        f"simpel evaluate {source or directory}          # with data=NAME: on all of a new file",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]

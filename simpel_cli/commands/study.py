@@ -21,7 +21,7 @@ from simpel_cli.problem import Assembled, System, assemble, normaliser_of, syste
 from simpel_cli.run import Settings, configure, stream
 
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
-GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation", "simulation")
+GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Study(NamedTuple):
 def settings_of(config: dict[str, Any]) -> Settings:
     """Build the `run:` group and refuse keys that no verb has."""
     for key in config:
-        if key not in (*GROUPS, "choices", "run_dir", "out"):
+        if key not in (*GROUPS, "choices", "run_dir", "out", "close"):
             raise ConfigError(f"{key}: no such key.{did_you_mean(key, list(GROUPS))} (groups: {', '.join(GROUPS)})")
     return build(config.get("run") or {}, "run", default=Settings)
 
@@ -124,7 +124,13 @@ class Fitted(NamedTuple):
     bind: Callable[[Problem], Inference]
     keys: Key[Array, " seeds"]
     training: list[tuple[np.ndarray, np.ndarray]]
+    available: int  # training transitions that `data.n_train` chose from
     normaliser: Normaliser
+
+    @property
+    def target_std(self) -> np.ndarray:
+        """Spread of the targets over the simulator's ranges, in data units, as the networks were trained with."""
+        return np.asarray(self.assembled.problems.normaliser.y_std[0], dtype=float)
 
 
 def prepare(study: Study) -> Fitted:
@@ -153,7 +159,7 @@ def prepare(study: Study) -> Fitted:
         precision=settings.precision,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
-    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, normaliser)
+    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
 
 
 def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:

@@ -139,17 +139,16 @@ def _collect(outcomes: list[Outcome], terminal: Terminal) -> None:
     path = write_metrics(root / "sweep.parquet", rows, {})
     terminal.line()
     terminal.line(str(path), "results")
-    for metric in ("nll", "rmse"):
-        figure = draw_sweep(path, metric)
-        if figure is not None:
-            terminal.line(str(figure), "figure")
+    figure = draw_sweep(path)
+    if figure is not None:
+        terminal.line(str(figure), "figure")
 
 
 def _result(directory: Path) -> str:
-    """Test NLL and RMSE of a finished job."""
+    """Joint test NLL and error of a finished job; the error has no unit, since a joint one may have several."""
     rows = read_metrics(directory / "metrics.parquet")
     shown = []
-    for metric in ("nll", "rmse"):
+    for metric, name in (("nll", "NLL"), ("nrmse", "normalised RMSE")):
         values = [r["value"] for r in rows if r["metric"] == metric and r["output"] == "joint"]
-        shown.append(f"{metric.upper()} {sum(values) / len(values):.3g}")
+        shown.append(f"{name} {sum(values) / len(values):.3g}")
     return "  ".join(shown)

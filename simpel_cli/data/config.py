@@ -25,7 +25,8 @@ class Measurements:
         columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
         split: `{column: name}` with the values train and test (other values are left out and counted), or
             `{test_files: [test.csv]}`: these of the files in `path` to test on, the others to train on, or
-            `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode.
+            `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode. A single
+            episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
             at the simulator's dt and is estimated where absent.
         resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.

@@ -24,13 +24,24 @@ def assign(config: Measurements, table: Table, rows: Rows, dynamic: bool, seed: 
     Raises:
         DataError: no train or no test rows, a split column that alternates within an episode, or too few episodes.
     """
+    detail = ""
     if "column" in config.split:
         label = split_labels(config, table, config.split["column"])[rows.number]
         _refuse_alternation(config.split["column"], rows, label, dynamic)
     else:
         rule = SPLIT_DEFAULT | dict(config.split)
-        choose = _by_time if rule["by"] == "time" else _by_episode
-        label = choose(rows, float(rule["test_fraction"]), seed)
+        fraction = float(rule["test_fraction"])
+        if rule["by"] == "time":
+            label = _by_time(rows, fraction)
+        elif _is_one_bag_of_rows(config, rows):
+            label = _by_row(rows, fraction, seed)
+            n_test = int(np.sum(label == "test"))
+            detail = (
+                f"one episode of a simulator without states, whose rows do not depend on each other: {n_test} of "
+                f"{len(label)} rows, drawn at random (seed {seed}), are the test"
+            )
+        else:
+            label = _by_episode(rows, fraction, seed)
     left_out = int(np.sum(~np.isin(label, PARTS)))
     others = ", ".join(repr(str(v)) for v in np.unique(label) if v not in PARTS)
     for part in PARTS:
@@ -39,7 +50,7 @@ def assign(config: Measurements, table: Table, rows: Rows, dynamic: bool, seed: 
             raise DataError(f"the {part} split is empty.{found} Values for use are 'train' and 'test' (data.split).")
     label = _first_episodes(config.n_episodes, rows, label)
     counts = [len(np.unique(rows.episode[label == part])) for part in PARTS]
-    detail = f"train rows from {counts[0]} and test rows from {counts[1]} episodes"
+    detail = detail or f"train rows from {counts[0]} and test rows from {counts[1]} episodes"
     if left_out:
         detail += f"; {left_out} rows marked {others} left out"
     return Check("split", True, detail), rows._replace(split=label)
@@ -57,8 +68,22 @@ def _by_episode(rows: Rows, fraction: float, seed: int) -> np.ndarray:
     return np.where(np.isin(rows.episode, chosen), "test", "train")
 
 
-def _by_time(rows: Rows, fraction: float, seed: int) -> np.ndarray:
-    """The end of every episode is its test; nothing is drawn, so that the seed has no part in it."""
+def _is_one_bag_of_rows(config: Measurements, rows: Rows) -> bool:
+    """One episode only, and no row of it needs another: no states, no past inputs, no filter over rows."""
+    static = rows.states.shape[1] == 0 and config.stack_actions == 0 and config.resample is None
+    return static and len(np.unique(rows.episode)) == 1
+
+
+def _by_row(rows: Rows, fraction: float, seed: int) -> np.ndarray:
+    n = len(rows.episode)
+    if n < 2:
+        raise DataError("data.split: there is one row only, which cannot be both train and test.")
+    chosen = stream(seed, "split").permutation(n)[: min(max(1, round(fraction * n)), n - 1)]
+    return np.where(np.isin(np.arange(n), chosen), "test", "train")
+
+
+def _by_time(rows: Rows, fraction: float) -> np.ndarray:
+    """The end of every episode is its test; nothing is drawn, so that no seed has a part in it."""
     _, code = np.unique(rows.episode, return_inverse=True)
     last = np.zeros(code.max() + 1, dtype=int)
     np.maximum.at(last, code, rows.position)

@@ -133,7 +133,7 @@ class FSVGD:
         def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Bool[Array, " b"], Int[Array, " k"]]:
             """Rows of the batch, which of them are data, and rows of the bank: the batch and distinct fresh points."""
             key_batch, key_offset, key_stride = jax.random.split(key, 3)
-            batch, is_data = distinct_rows(key_batch, min(self.batch, n_rows), problem.m)
+            batch, is_data = distinct_rows(key_batch, min(self.batch, n_rows), jnp.asarray(problem.m))
             # an odd stride visits a power of two of rows without repeats: distinct points without a sort
             b, kind = batch.shape[0], batch.dtype
             offset = jax.random.randint(key_offset, (), 0, self.pool, kind)

@@ -110,3 +110,41 @@ def test_more_than_there_are(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data.n_train: 55 .* the data have 54") as error:
         select(transitions(read_rows(tmp_path).train, 0), 55, "random", 0)
     assert error.value.exit_code == 3
+
+
+STATIC = Declared(
+    name="line", dt=1.0, inputs={"x": {"range": [0, 1000]}}, parameters={"a": {"range": [0, 2]}},
+    outputs={"f": {"expression": "a*x"}},
+).model()  # fmt: skip
+
+
+def read_points(folder: Path, seed: int = 0, rows: int = 40, **keys: Any) -> Recording:
+    (folder / "d.csv").write_text("x,f\n" + "".join(f"{i},{2 * i + (i % 7)}\n" for i in range(rows)))
+    return read(Measurements("d.csv", **keys), STATIC, folder, seed)
+
+
+def points(recording: Recording) -> tuple[list[float], list[float]]:
+    train, test = (transitions(part, 0).inputs[:, 0].tolist() for part in (recording.train, recording.test))
+    return train, test
+
+
+def test_one_episode_without_states_is_split_by_rows(tmp_path: Path) -> None:
+    recording = read_points(tmp_path)
+    train, test = points(recording)
+    assert sorted(train + test) == list(range(40))
+    assert len(test) == 10
+    assert test != list(range(30, 40))  # drawn at random, not the end
+    (check,) = [c for c in recording.checks if c.name == "split"]
+    assert check.ok
+    assert "10 of 40 rows, drawn at random (seed 0), are the test" in check.detail
+    assert points(read_points(tmp_path)) == (train, test)
+    assert points(read_points(tmp_path, seed=1)) != (train, test)
+    assert len(points(read_points(tmp_path, rows=2))[1]) == 1
+    assert points(read_points(tmp_path, split={"by": "time"}))[1] == list(range(30, 40))
+
+
+def test_rows_that_need_their_neighbours_are_not_split_at_random(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="one episode only"):
+        read_points(tmp_path, stack_actions=1)
+    with pytest.raises(DataError, match="one row only"):
+        read_points(tmp_path, rows=1)

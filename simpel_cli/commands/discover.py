@@ -1,0 +1,186 @@
+"""`simpel discover`: find what the simulator lacks, name it, add it, and say how much that helps."""
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from simpel_cli.commands.study import open_study, resolved, settings_of
+from simpel_cli.config import Job, dump
+from simpel_cli.console import Terminal
+from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.corrected import corrected
+from simpel_cli.discovery.fit import Fitter
+from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.selection import Search, Selection
+from simpel_cli.discovery.settings import Discovery
+from simpel_cli.discovery.setup import setup, test_windows
+from simpel_cli.discovery.verdict import verdict_of
+from simpel_cli.errors import ConfigError, Inconclusive
+from simpel_cli.nodes import build
+from simpel_cli.records import write_table, write_text
+from simpel_cli.run import Manifest, make_directory, refuse_occupied
+from simulators.effects import Expression
+from simulators.model import Model
+
+SUBSTEPS = 2
+
+
+def discover(job: Job, *, strict: bool = False) -> None:
+    """Run a search in its run directory.
+
+    Raises:
+        Inconclusive: `strict` and another verdict than `effect`.
+    """
+    settings = settings_of(job.config)
+    directory = make_directory(job.directory)
+    refuse_occupied(directory)
+    config = resolved(job) | {"run": {**(job.config.get("run") or {}), "precision": "float64"}}
+    write_text(directory / "config.yaml", dump(config))
+    with Manifest(directory, "discover", settings) as manifest, jax.enable_x64(True):
+        found = _run(config, directory, job.data_folder, manifest)
+    if strict and found["verdict"] != "effect":
+        raise Inconclusive(f"verdict {found['verdict']}: {found['summary']}")
+
+
+def effects_of(node: Mapping[str, Any] | None, plugins: tuple[str, ...]) -> list[Expression]:
+    """Build the catalogue that a configuration names."""
+    if not node:
+        raise ConfigError(
+            "effect: none chosen; use effect=[all], or name some, e.g. effect=[coulomb_friction,input_delay]."
+        )
+    return [build(dict(entry), f"effect.{name}", plugins) for name, entry in node.items()]
+
+
+def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest) -> dict[str, Any]:
+    began = time.perf_counter()
+    study = open_study(config, data_folder)
+    manifest.add_inputs(study.recording.files)
+    model = study.system.source
+    if not isinstance(model, Model):
+        raise ConfigError(
+            "sim: discover needs a simulator in symbols, since effects are terms of it; a world has none."
+        )
+    terminal = Terminal(study.settings.quiet, directory / "run.log")
+    options: Discovery = build(config.get("discovery") or {}, "discovery", default=Discovery)
+    effects = effects_of(config.get("effect"), study.settings.plugins)
+    terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
+    bad = [c for c in study.recording.checks if not c.ok]
+    terminal.line(
+        "; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(study.recording.checks)} ok", "data"
+    )
+    plan = setup(
+        model,
+        study.recording,
+        tuple(study.measurements.noise_std),
+        effects,
+        options.substeps or min(model.substeps, SUBSTEPS),
+    )
+    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
+    search = Search(plan, fitter, lambda text: terminal.line(text, "search"))
+    selection = search.run()
+    assessor = Assessor(plan, options.horizon)
+    selection, gates = _gated(search, assessor, selection, terminal)
+    windows = test_windows(plan, study.recording.test, study.recording.outputs)
+    before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
+    found = verdict_of(
+        search,
+        selection,
+        gates,
+        before,
+        after,
+        windows,
+        study.recording.checks,
+        options.horizon,
+        time.perf_counter() - began,
+    )
+    if selection.chosen.terms and isinstance(config["sim"].get("dynamics"), dict):
+        name, node, left_out = corrected(config["sim"], search, selection.chosen)
+        path = directory / "conf" / "sim" / f"{name}.yaml"
+        path.parent.mkdir(parents=True)
+        write_text(path, f"# {found['summary']}\n" + dump(node))
+        found |= {"corrected_sim": str(path.relative_to(directory)), "corrected_sim_lacks": left_out}
+    write_text(directory / "verdict.json", json.dumps(found, indent=1))
+    _tables(directory, search, selection)
+    _show(terminal, found, directory, config)
+    return found
+
+
+def _gated(
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
+) -> tuple[Selection, list[Gate]]:
+    """Judge every accepted step on held-out episodes; a step that does not help there ends the list of effects."""
+    gates: list[Gate] = []
+    for i, (before, after) in enumerate(zip(selection.path[:-1], selection.path[1:], strict=True)):
+        judged = gate(search, assessor, before, after)
+        gates.append(judged)
+        added = [search.terms[t].label for t in after.terms if t not in before.terms]
+        terminal.line(
+            f"{' and '.join(added)}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
+            f" by {judged.unit}{'' if judged.passed else ', not certain: not accepted'}",
+            "gate",
+        )
+        if not judged.passed:
+            kept = before.terms
+            order = [selection.chosen.terms.index(t) for t in kept if t in selection.chosen.terms]
+            return selection._replace(
+                chosen=before,
+                path=selection.path[: i + 1],
+                classes=tuple(selection.classes[j] for j in order),
+                gains=tuple(selection.gains[j] for j in order),
+            ), gates[:i]
+    return selection, gates
+
+
+def _tables(directory: Path, search: Search, selection: Selection) -> None:
+    import numpy as np
+
+    rows = [
+        (step, search.terms[t.terms[-1]], t, t.optimum.log_evidence - stage.before.optimum.log_evidence)
+        for step, stage in enumerate(selection.stages, start=1)
+        for t in stage.trials
+    ]
+    write_table(
+        directory / "candidates.parquet",
+        {
+            "step": np.array([s for s, *_ in rows], np.int32),
+            "effect": np.array([t.effect for _, t, *_ in rows]),
+            "acts_on": np.array([t.acts_on for _, t, *_ in rows]),
+            "depends_on": np.array([",".join(t.depends_on) for _, t, *_ in rows]),
+            "expression": np.array([t.expression or t.kind for _, t, *_ in rows]),
+            "log_evidence_gain": np.array([g for *_, g in rows]),
+            "accepted": np.array([t.terms[-1] in selection.chosen.terms for _, _, t, _ in rows]),
+            "converged": np.array([t.optimum.converged for _, _, t, _ in rows]),
+        },
+    )
+
+
+def _show(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> None:
+    terminal.line()
+    terminal.line(found["summary"], style="bold")
+    error = found["error"]
+    if found["effects"]:
+        terminal.line(f"{'':<24}{'before':>12}{'after':>12}{'noise floor':>14}")
+        for key, label in (
+            ("one_step", "one step"),
+            ("horizon", f"{error['horizon_steps']} rows ahead"),
+            ("free_run", "free run"),
+        ):
+            for name in error["before"][key]:
+                old, new = error["before"][key][name], error["after"][key][name]
+                terminal.line(f"{label:<15}{name:<9}{old:>12.4g}{new:>12.4g}{found['noise_floor'][name]:>14.3g}")
+    small = ", ".join(
+        f"{n['name'].replace('_', ' ')} {n['smallest_detectable']:.2g} {n['unit']}" for n in found["not_found"][:6]
+    )
+    if small:
+        terminal.line(f"Not found, and smaller than: {small}")
+    terminal.line(f"{found['candidates_tried']} candidates, {found['seconds']:.0f} s", "time")
+    terminal.line(str(directory / "verdict.json"), "verdict")
+    if found["corrected_sim"]:
+        name = Path(found["corrected_sim"]).stem
+        data = config["choices"].get("data", "")
+        terminal.line(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={data}", "next")

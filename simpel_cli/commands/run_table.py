@@ -1,0 +1,65 @@
+"""The report's table of how a result came about: data used, what was learned beside the networks, software, time."""
+
+import platform
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.commands.judge import Judged
+from simpel_cli.commands.study import Fitted, Study
+from simpel_cli.run import Manifest, versions
+
+PHASES = (("compilation", "compile_seconds"), ("training", "train_seconds"))
+
+
+def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) -> dict[str, Any]:
+    """Return the table of a fit, or of an evaluation and the fit that it judges.
+
+    Args:
+        study: what was fitted.
+        fitted: its problems, as they were trained.
+        judged: has the learned noise.
+        manifest: of the verb that runs; `facts` may hold the seconds of compilation and training.
+    """
+    used, seeds = len(fitted.training[0][0]), study.settings.all_seeds
+    software = {"python": platform.python_version()} | versions()
+    rows = [
+        ("method", _method(study)),
+        ("training", f"{used} of {fitted.available} {'transitions' if study.system.source.states else 'rows'}"),
+        ("seeds", ", ".join(map(str, seeds))),
+        ("gap scale kappa", _kappa(study, fitted)),
+        ("learned noise", _per_output(study, judged.noise_std)),
+        ("device", f"{manifest.facts.get('device', study.device)}, {study.settings.precision}"),
+        ("time", _time(manifest)),
+        ("software", ", ".join(f"{name} {version}" for name, version in software.items() if version)),
+    ]
+    return {"title": "Run", "head": (), "rows": rows, "text": True}
+
+
+def _method(study: Study) -> str:
+    method, score = study.choices.get("method", ""), study.choices.get("score", "")
+    return f"{method} ({score} score), {study.method.particles} particles, {study.method.steps} steps"
+
+
+def _kappa(study: Study, fitted: Fitted) -> str:
+    if study.prior.gap is None:
+        return "no gap GP"
+    scale = np.asarray(fitted.assembled.problems.gap_scale, dtype=float)
+    return _per_output(study, scale * fitted.target_std)
+
+
+def _per_output(study: Study, values: np.ndarray) -> str:
+    """Values (seeds, dy) with their units; a range where seeds differ."""
+    encoding = study.system.encoding
+    shown = []
+    for name, unit, column in zip(encoding.y_names, encoding.y_units, np.asarray(values).T, strict=True):
+        low, high = f"{column.min():.3g}", f"{column.max():.3g}"
+        number = low if low == high else f"{low}..{high}"
+        shown.append(f"{name} {number}" + ("" if unit in ("1", "") else f" {unit}"))
+    return ", ".join(shown)
+
+
+def _time(manifest: Manifest) -> str:
+    facts = manifest.facts
+    parts = [f"{what} {facts[key]:.1f} s" for what, key in PHASES if key in facts]
+    return ", ".join([*parts, f"{manifest.wall_seconds:.1f} s in all until this report"])

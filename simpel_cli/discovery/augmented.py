@@ -1,0 +1,106 @@
+"""One model that carries every candidate effect at every place, each switched off at its neutral value.
+
+A compile takes seconds and there are dozens of candidates: so one program is compiled for all of them, and a fit chooses
+by which parameters it moves.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import casadi
+import numpy as np
+
+from simulators.effects import Structure, Term, structure
+from simulators.effects.term import DELAY, INPUT, LAG, OPERATORS, RATE, SENSOR, SENSOR_DELAY
+from simulators.expression import parse
+from simulators.model import Model, Quantity
+
+
+class Augmented(NamedTuple):
+    """A model with candidate terms.
+
+    Args:
+        model: the simulator as it was.
+        terms: candidates.
+        measured: names of the measured states and outputs, the rows of a measurement.
+        function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, then all knobs.
+        params: the rows of p.
+        neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
+        operators: kind -> (index of the signal, row of p) for delays and lags.
+        roles: of the states.
+    """
+
+    model: Model
+    terms: tuple[Term, ...]
+    measured: tuple[str, ...]
+    function: casadi.Function
+    params: tuple[Quantity, ...]
+    neutral: np.ndarray
+    operators: dict[str, tuple[tuple[int, int], ...]]
+    roles: Structure
+
+    def rows(self, term: Term) -> list[int]:
+        """Rows of p that belong to a term."""
+        names = [q.name for q in self.params]
+        return [names.index(k.name) for k in term.knobs]
+
+
+def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Augmented:
+    """Attach every term to the model."""
+    params = [*model.params]
+    neutral = [centre(q) for q in model.params]
+    for term in terms:
+        for knob in term.knobs:
+            params.append(Quantity(knob.name, knob.unit, knob.low, knob.high, prior=knob.prior))
+            neutral.append(knob.neutral)
+    x = model.symbol.sym("x", len(model.states), 1)
+    u = model.symbol.sym("u", len(model.inputs), 1)
+    p = model.symbol.sym("p", len(params), 1)
+    own = p[: len(model.params)]
+    names: dict[str, Any] = {name: model.symbol(value) for name, value in model.fixed.items()}
+    names |= {q.name: p[i] for i, q in enumerate(params)}
+    names |= {q.name: x[i] for i, q in enumerate(model.states)}
+    given = [u[j] for j in range(len(model.inputs))]
+    for j, q in enumerate(model.inputs):
+        for term in terms:
+            if term.kind == INPUT and term.acts_on == q.name:
+                given[j] = parse(term.expression, names | {q.name: given[j]}, model.symbol)
+    effective = casadi.vertcat(*given) if given else model.symbol(0, 1)
+    names |= {q.name: given[j] for j, q in enumerate(model.inputs)}
+    base = model.rhs(x, effective, own)
+    rates = [base[i] for i in range(len(model.states))]
+    for i, q in enumerate(model.states):
+        for term in terms:
+            if term.kind == RATE and term.acts_on == q.name:
+                rates[i] += parse(term.expression, names | {"rate": base[i]}, model.symbol)
+    outputs = model.output(x, effective, own)
+    values = {q.name: x[i] for i, q in enumerate(model.states)}
+    values |= {q.name: outputs[i] for i, q in enumerate(model.outputs)}
+    channels = []
+    for name in measured:
+        value = values[name]
+        for term in terms:
+            if term.kind == SENSOR and term.acts_on == name:
+                value = parse(term.expression, names | {name: value}, model.symbol)
+        channels.append(value)
+    function = casadi.Function(
+        f"{model.name}_augmented",
+        [x, u, p],
+        [casadi.vertcat(*rates) if rates else model.symbol(0, 1), casadi.vertcat(*channels)],
+        ["x", "u", "p"],
+        ["dx", "y"],
+    )
+    columns = [q.name for q in params]
+    signals = {DELAY: [q.name for q in model.inputs], LAG: [q.name for q in model.inputs], SENSOR_DELAY: [*measured]}
+    operators = {
+        kind: tuple((signals[kind].index(t.acts_on), columns.index(t.knobs[0].name)) for t in terms if t.kind == kind)
+        for kind in OPERATORS
+    }
+    return Augmented(
+        model, tuple(terms), tuple(measured), function, tuple(params), np.array(neutral), operators, structure(model)
+    )
+
+
+def centre(q: Quantity) -> float:
+    """Middle of a prior."""
+    return float(np.sqrt(q.low * q.high)) if q.prior == "lognormal" else (q.low + q.high) / 2

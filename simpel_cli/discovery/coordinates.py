@@ -1,0 +1,98 @@
+"""The unknowns of a fit, each mapped onto the unit interval between its bounds.
+
+theta = (parameters and knobs p, log r, log q). In these coordinates a uniform prior has density 1, bounds are 0 and 1,
+and every unknown has the same scale, so that damping and floors need no units.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from simpel_cli.discovery.augmented import Augmented
+from simpel_cli.discovery.filter import Noise
+
+CUT = 4.0  # standard deviations at which a normal prior is bounded
+
+
+class Coordinates(NamedTuple):
+    """Bounds and priors of all unknowns; one more entry at the end is a place for padding.
+
+    Args:
+        low, high: (n,) bounds, of the logarithm where `log`.
+        log: (n,) whether the logarithm is what is uniform or normal.
+        normal: (n,) whether the prior is normal about the middle, with +-2 sd inside the declared range.
+        sizes: numbers of (p, r, q) entries.
+        driven: rows of the state that process noise acts on.
+        nx: number of states.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    log: np.ndarray
+    normal: np.ndarray
+    sizes: tuple[int, int, int]
+    driven: tuple[int, ...]
+    nx: int
+
+    def physical(self, z: Float[Array, " n"]) -> tuple[Array, Noise]:
+        """Return p and the noise at unit coordinates z."""
+        value = self.low + z * (self.high - self.low)
+        value = jnp.where(self.log, jnp.exp(jnp.where(self.log, value, 0.0)), value)
+        n_p, n_r, n_q = self.sizes
+        q = jnp.zeros(self.nx, value.dtype).at[jnp.array(self.driven, int)].set(value[n_p + n_r : n_p + n_r + n_q])
+        return value[:n_p], Noise(value[n_p : n_p + n_r], q)
+
+    def unit(self, index: int | np.ndarray, value: float | np.ndarray) -> np.ndarray:
+        """Return the unit coordinate of a physical value, kept inside the bounds."""
+        value = np.asarray(value, float)
+        v = np.where(self.log[index], np.log(np.maximum(value, 1e-300)), value)
+        return np.clip((v - self.low[index]) / (self.high[index] - self.low[index]), 0.0, 1.0)
+
+    def value(self, index: int, z: float) -> float:
+        """Return the physical value of one unit coordinate."""
+        v = self.low[index] + z * (self.high[index] - self.low[index])
+        return float(np.exp(v)) if self.log[index] else float(v)
+
+    def sd_of_prior(self) -> np.ndarray:
+        """Standard deviation of the normal priors in unit coordinates, inf where uniform."""
+        return np.where(self.normal, 1 / (2 * CUT), np.inf)
+
+
+DECLARED_SD = 0.1  # of the logarithm of a measurement noise that the user declared
+ESTIMATED_SPAN = (1 / 30, 3.0)  # factors within which a noise that was estimated from differences may lie
+
+
+def coordinates_of(
+    augmented: Augmented, r: np.ndarray, declared: np.ndarray, q_low: np.ndarray, q_high: np.ndarray
+) -> Coordinates:
+    """Return the coordinates of all unknowns.
+
+    Args:
+        augmented: model with candidates.
+        r: (ny,) measurement noise. Third differences take what the model does for noise where the data are clean, so an
+            estimate may be far too large, hardly too small.
+        declared: (ny,) whether the user declared it.
+        q_low: (n_driven,) lower bounds of the process noise.
+        q_high: (n_driven,) upper bounds.
+    """
+    rows: list[tuple[float, float, bool, bool]] = []  # low, high, log, normal
+    base = len(augmented.model.params)
+    for i, q in enumerate(augmented.params):
+        prior = q.prior if i < base or q.prior == "normal" else "uniform"
+        low, high = (np.log(q.low), np.log(q.high)) if prior == "lognormal" else (q.low, q.high)
+        if prior == "uniform":
+            rows.append((low, high, False, False))
+        else:
+            middle, sd = (low + high) / 2, (high - low) / 4
+            rows.append((middle - CUT * sd, middle + CUT * sd, prior == "lognormal", True))
+    for value, known in zip(r, declared, strict=True):
+        factors = np.exp(np.array([-CUT, CUT]) * DECLARED_SD) if known else ESTIMATED_SPAN
+        rows.append((np.log(value * factors[0]), np.log(value * factors[1]), True, bool(known)))
+    rows += [(np.log(low), np.log(high), True, False) for low, high in zip(q_low, q_high, strict=True)]
+    rows.append((0.0, 1.0, False, False))  # padding
+    states = [q.name for q in augmented.model.states]
+    driven = tuple(states.index(name) for name in states if name in augmented.roles.dynamic)
+    low, high, log, normal = (np.array(column) for column in zip(*rows, strict=True))
+    return Coordinates(low, high, log, normal, (len(augmented.params), len(r), len(driven)), driven, len(states))

@@ -1,0 +1,231 @@
+"""Which effects the model lacks: forward and backward selection by evidence, with every known parameter refitted.
+
+Held at their old values, the known parameters would leave remainders that look like effects. A named effect has to beat
+every other name and every function without one; names that do as well form a class.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.discovery.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.setup import Setup
+from simulators.effects import Term
+
+ACCEPT = 4.5  # nats of evidence that an effect must earn
+TIE = 3.0  # nats within which two names are not told apart
+SCREEN = 4  # iterations after which the hopeless are left alone
+KEPT = 14  # of a stage after the screening
+MOST_EFFECTS = 5
+GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
+STARTS = 6  # of the model as it is
+
+
+class Trial(NamedTuple):
+    """One set of effects and where its fit came to rest."""
+
+    terms: tuple[int, ...]
+    optimum: Optimum
+
+
+class Stage(NamedTuple):
+    """One step of the forward selection: every candidate's fit, best first."""
+
+    before: Trial
+    trials: tuple[Trial, ...]  # each is `before` and one term more
+
+
+class Selection(NamedTuple):
+    """What the search found.
+
+    Args:
+        base: the simulator as it is, calibrated.
+        chosen: with the effects that earned their place.
+        path: fits after each accepted effect, from `base` on.
+        classes: per chosen term, trials that do as well with another name in its place, or clearly better with a
+            function that has no name.
+        stages: all that was tried; the last one found nothing more.
+        gains: evidence that each chosen term adds to the rest.
+        remainder: an unnamed function that the data still ask for, and its gain.
+        tried: number of candidates fitted.
+    """
+
+    base: Trial
+    chosen: Trial
+    path: tuple[Trial, ...]
+    classes: tuple[tuple[Trial, ...], ...]
+    stages: tuple[Stage, ...]
+    gains: tuple[float, ...]
+    remainder: tuple[Term, float] | None
+    tried: int
+
+
+class Search:
+    """The search over sets of effects of one setup."""
+
+    def __init__(self, plan: Setup, fitter: Fitter, told: Callable[[str], None] = lambda _: None) -> None:
+        self.plan, self.fitter, self.told = plan, fitter, told
+        self.terms = plan.augmented.terms
+        n_p, n_r, n_q = plan.coordinates.sizes
+        self.always = tuple(range(len(plan.augmented.model.params))) + tuple(range(n_p, n_p + n_r + n_q))
+        self.noise = tuple(range(n_p, n_p + n_r + n_q))
+        self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
+        self.ones = np.ones(len(plan.windows.episode))
+        self.tried = 0
+
+    def free(self, terms: Sequence[int]) -> tuple[int, ...]:
+        """Unknowns that move when these terms are there."""
+        return self.always + tuple(row for t in terms for row in self.rows[t])
+
+    def fits(self, terms: Sequence[int]) -> bool:
+        """Whether the compiled program has room for them."""
+        return len(self.free(terms)) <= self.fitter.width
+
+    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray, weight: np.ndarray | None = None) -> list[Lane]:
+        """Starts of a set of terms of which one is new and begins at each of its start points."""
+        knobs = self.terms[new].knobs
+        lanes = []
+        for s in range(max(len(k.starts) for k in knobs)):
+            start = z.copy()
+            for row, knob in zip(self.rows[new], knobs, strict=True):
+                start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
+            lanes.append(Lane(start, self.free(terms), self.ones if weight is None else weight))
+        return lanes
+
+    def off(self, z: np.ndarray, terms: Sequence[int]) -> np.ndarray:
+        """Switch terms off."""
+        z = z.copy()
+        for t in terms:
+            rows = list(self.rows[t])
+            z[rows] = self.plan.start[rows]
+        return z
+
+    def base(self) -> Trial:
+        """Calibrate the simulator as it is, from several starts."""
+        random = np.random.default_rng(0)
+        starts = [self.plan.start]
+        n = len(self.plan.augmented.model.params)
+        for _ in range(STARTS - 1):
+            z = self.plan.start.copy()
+            z[:n] = random.uniform(0.1, 0.9, n)
+            starts.append(z)
+        found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
+        return Trial((), max(found, key=lambda o: o.log_evidence))
+
+    def add(self, before: Trial, candidates: Sequence[int]) -> list[Trial]:
+        """Fit `before` with one of the candidates more, each from all of its starts; best first.
+
+        A few iterations tell the hopeless; the others go on to the end.
+        """
+        owners, lanes = [], []
+        for t in candidates:
+            terms = (*before.terms, t)
+            for lane in self.lanes(terms, t, before.optimum.z):
+                owners.append(terms)
+                lanes.append(lane)
+        self.tried += len(candidates)
+        screened = self.fitter(lanes, SCREEN)
+        order = sorted(range(len(lanes)), key=lambda i: -screened[i].log_evidence)
+        going = order[:KEPT] + [i for i in order[KEPT:] if self.terms[owners[i][-1]].depends_on][:KEPT]
+        final = self.fitter([Lane(screened[i].z, lanes[i].free, self.ones) for i in going])
+        best: dict[tuple[int, ...], Optimum] = {}
+        for i, optimum in [*zip(going, final, strict=True), *enumerate(screened)]:
+            if owners[i] not in best or optimum.log_evidence > best[owners[i]].log_evidence:
+                best[owners[i]] = optimum
+        trials = [Trial(terms, optimum) for terms, optimum in best.items()]
+        return sorted(trials, key=lambda t: -t.optimum.log_evidence)
+
+    def best_named(self, trials: Sequence[Trial]) -> Trial | None:
+        """Best trial with a named new effect; a more general name must earn its generality over a simpler one."""
+        named = [t for t in trials if not self.terms[t.terms[-1]].depends_on]
+        if not named:
+            return None
+        best = named[0]
+        own = self.terms[best.terms[-1]]
+        for other in named[1:]:
+            term = self.terms[other.terms[-1]]
+            simpler = term.effect in own.generalises and term.acts_on == own.acts_on
+            if simpler and best.optimum.log_evidence - other.optimum.log_evidence < ACCEPT:
+                best, own = other, term
+        return best
+
+    def candidates(self, terms: Sequence[int]) -> list[int]:
+        """Terms that can still be added."""
+        return [t for t in range(len(self.terms)) if t not in terms and self.fits((*terms, t))]
+
+    def run(self) -> Selection:
+        """Search."""
+        current = base = self.base()
+        path, stages = [base], []
+        remainder = None
+        self.told("calibrated")
+        while True:
+            trials = self.add(current, self.candidates(current.terms))
+            if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
+                again = self.fitter(
+                    [Lane(self.off(t.optimum.z, t.terms[-1:]), self.free(current.terms), self.ones) for t in trials[:4]]
+                )
+                better = max(again, key=lambda o: o.log_evidence)
+                if better.log_evidence > current.optimum.log_evidence + 1:
+                    current = Trial(current.terms, better)
+                    path[-1] = current
+                    base = current if not current.terms else base
+                    continue
+            stages.append(Stage(current, tuple(trials)))
+            best = self.best_named(trials)
+            unnamed = next((t for t in trials if self.terms[t.terms[-1]].depends_on), None)
+            gain = best.optimum.log_evidence - current.optimum.log_evidence if best else -np.inf
+            gain_unnamed = unnamed.optimum.log_evidence - current.optimum.log_evidence if unnamed else -np.inf
+            if best is None or gain <= ACCEPT or len(current.terms) == MOST_EFFECTS:
+                if unnamed is not None and gain_unnamed > ACCEPT:
+                    remainder = (self.terms[unnamed.terms[-1]], float(gain_unnamed))
+                break
+            current = best
+            path.append(current)
+            self.told(f"{self.terms[best.terms[-1]].label} +{gain:.0f}")
+        chosen, gains = self.prune(current)
+        if chosen.terms != current.terms:
+            path = [t for t in path if set(t.terms) <= set(chosen.terms)]
+            path = path if path[-1].terms == chosen.terms else [*path, chosen]
+        classes = tuple(self.rivals(chosen, i) for i in range(len(chosen.terms)))
+        return Selection(base, chosen, tuple(path), classes, tuple(stages), gains, remainder, self.tried)
+
+    def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...]]:
+        """Drop what no longer earns its place; return the rest and what each term adds to it."""
+        while current.terms:
+            without = self.without(current)
+            gains = [current.optimum.log_evidence - t.optimum.log_evidence for t in without]
+            weakest = int(np.argmin(gains))
+            if gains[weakest] >= ACCEPT:
+                return current, tuple(gains)
+            current = without[weakest]
+        return current, ()
+
+    def without(self, current: Trial) -> list[Trial]:
+        """Fit every set that lacks one of the terms."""
+        sets = [tuple(t for t in current.terms if t != gone) for gone in current.terms]
+        lanes = []
+        for gone, rest in zip(current.terms, sets, strict=True):
+            z = self.off(current.optimum.z, (gone,))
+            n_p, n_r, n_q = self.plan.coordinates.sizes
+            loud = z.copy()  # the noise that the term explained has to go somewhere
+            loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
+            lanes += [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
+        found = self.fitter(lanes)
+        return [Trial(rest, max(found[2 * i : 2 * i + 2], key=lambda o: o.log_evidence)) for i, rest in enumerate(sets)]
+
+    def rivals(self, chosen: Trial, position: int) -> tuple[Trial, ...]:
+        """Return the trials in which another name takes the place of one chosen term and does as well."""
+        own = chosen.terms[position]
+        rest = tuple(t for t in chosen.terms if t != own)
+        others = [t for t in self.candidates(rest) if t != own]
+        smaller = Trial(rest, chosen.optimum._replace(z=self.off(chosen.optimum.z, (own,))))
+        trials = self.add(smaller, others)
+        top, own_effect = chosen.optimum.log_evidence, self.terms[own].effect
+        return tuple(
+            t
+            for t in trials
+            if t.optimum.log_evidence >= top + (ACCEPT if self.terms[t.terms[-1]].depends_on else -TIE)
+            and own_effect not in self.terms[t.terms[-1]].generalises
+        )

@@ -1,0 +1,29 @@
+"""The `discovery:` group."""
+
+from dataclasses import dataclass
+
+from simpel_cli.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How the search runs.
+
+    Args:
+        horizon: how far ahead errors are judged, in rows.
+        substeps: Runge-Kutta steps per row in the filter; null = the simulator's own, 2 at most.
+        lanes: fits that run side by side in the compiled program.
+        room: unknowns of effects that a hypothesis can have at once.
+    """
+
+    horizon: int = 20
+    substeps: int | None = None
+    lanes: int = 8
+    room: int = 9
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "lanes", "room"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"discovery.{name}: got {getattr(self, name)}; it must be at least 1.")
+        if self.substeps is not None and self.substeps < 1:
+            raise ConfigError(f"discovery.substeps: got {self.substeps}; it must be at least 1.")

@@ -1,0 +1,122 @@
+"""From a simulator, measurements and a catalogue of effects to everything that a search needs."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery import windows as windows_
+from simpel_cli.discovery.augmented import Augmented, augment
+from simpel_cli.discovery.coordinates import Coordinates, coordinates_of
+from simpel_cli.discovery.filter import Filter, filter_of
+from simpel_cli.discovery.windows import Windows, windows_of
+from simpel_cli.errors import DataError
+from simulators.effects import Expression, Scales, Term, unnamed
+from simulators.effects.term import DELAY, LAG
+from simulators.model import Model
+
+LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
+Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
+STEP_TOLERANCE = 0.02  # of the measurement noise: what the integrator may err in one row
+FOLDS = 5
+
+
+class Setup(NamedTuple):
+    """What a search works with."""
+
+    augmented: Augmented
+    rule: Filter
+    coordinates: Coordinates
+    windows: Windows
+    scales: Scales
+    start: np.ndarray  # (n,) unit coordinates with every effect switched off
+    lead: int
+    substeps: int
+
+
+def setup(
+    model: Model, recording: Recording, declared_noise: Sequence[str], effects: Sequence[Expression], substeps: int
+) -> Setup:
+    """Attach every effect, cut the training episodes into windows and bind the filter.
+
+    Args:
+        model: the simulator.
+        recording: its measurements.
+        declared_noise: names of the channels whose noise the user declared.
+        effects: the catalogue, or what of it is to be tried.
+        substeps: Runge-Kutta steps per row.
+
+    Raises:
+        DataError: too few rows.
+    """
+    rows = sum(len(e.time) for e in recording.train)
+    if rows < LEAST_ROWS:
+        raise DataError(
+            f"data: {rows} training rows; discover needs at least {LEAST_ROWS} to tell a missing effect from noise. "
+            "Record more, or leave fewer for the test split (data.split)."
+        )
+    if any(e.next_states is not None for e in recording.train):
+        raise DataError(
+            "data.layout: discover follows episodes in time; give layout `trajectories`, not `transitions`."
+        )
+    measured = tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
+    scales = scales_of(model, recording.train, measured, recording.outputs)
+    terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(model, scales)
+    augmented = augment(model, terms, measured)
+    longest = max((k.high for t in terms if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
+    lead = int(np.ceil(longest / model.dt)) + 2
+    spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
+    middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
+    windows = windows_of(
+        recording.train, [q.name for q in model.states], measured, recording.outputs, middle, lead=lead,
+        at_least=4 if len(recording.train) < 4 else 1,
+    )  # fmt: skip
+    rule = filter_of(augmented, substeps=substeps, lead=lead, spread=spread)
+    r = np.array([max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured])
+    driven = [q.name for q in model.states if q.name in augmented.roles.dynamic]
+    typical = np.array([scales.rate[name] * np.sqrt(model.dt) for name in driven])
+    coordinates = coordinates_of(
+        augmented,
+        r,
+        np.array([name in declared_noise for name in measured]),
+        typical * Q_BOUNDS[0],
+        typical * Q_BOUNDS[1],
+    )
+    n_p, n_r, n_q = coordinates.sizes
+    start = np.full(len(coordinates.low), 0.5)
+    low, high = coordinates.low[:n_p], coordinates.high[:n_p]
+    base = len(model.params)
+    start[base:n_p] = (augmented.neutral[base:] - low[base:]) / (high[base:] - low[base:])
+    start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
+    start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
+    return Setup(augmented, rule, coordinates, windows, scales, start, lead, substeps)
+
+
+def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str], outputs: Sequence[str]) -> Scales:
+    """Read the magnitudes of all quantities off the measurements; of what is not measured, off its range."""
+    states = np.concatenate([e.states for e in episodes])
+    inputs = np.concatenate([e.inputs for e in episodes])
+    values = np.concatenate([e.outputs for e in episodes])
+    size: dict[str, float] = {}
+    rate: dict[str, float] = {}
+    for i, q in enumerate(model.states):
+        known = q.name in measured
+        size[q.name] = float(np.nanmax(np.abs(states[:, i]))) if known else max(abs(q.low), abs(q.high))
+        steps = np.concatenate([np.diff(e.states[:, i]) for e in episodes]) / model.dt
+        rate[q.name] = max(float(np.nanstd(steps)), 1e-9 * (q.high - q.low)) if known else (q.high - q.low) / 2
+    for j, q in enumerate(model.inputs):
+        size[q.name] = float(np.nanmax(np.abs(inputs[:, j])))
+    for k, name in enumerate(outputs):
+        size[name] = float(np.nanmax(np.abs(values[:, k])))
+    return Scales({k: max(v, 1e-9) for k, v in size.items()}, rate, model.dt)
+
+
+def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str]) -> Windows:
+    """Cut held-out episodes into windows like those of the search, each as long as its episode."""
+    model = plan.augmented.model
+    middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
+    return windows_of(
+        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, middle, lead=plan.lead,
+        longest=windows_.LONGEST_TEST,
+    )  # fmt: skip

@@ -1,0 +1,57 @@
+"""Inputs as they arrive: delayed and lagged, as means over the integrator's substeps.
+
+A held input is a staircase; its integral U(t) is piecewise linear, so the mean over a substep that lies d in the past,
+(U(t + h - d) - U(t - d))/h, is continuous in d, below one sample too.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def arriving(
+    u: Float[Array, "R nu"],
+    delay: Float[Array, " nu"],
+    lag: Float[Array, " nu"],
+    *,
+    dt: float,
+    substeps: int,
+    lead: int,
+) -> Float[Array, "T substeps nu"]:
+    """Return the input of every substep of the rows behind the lead.
+
+    Args:
+        u: inputs, held from a row to the next; the first `lead` rows are the past.
+        delay: s, per input.
+        lag: time constant of a first-order lag behind the delay, s, per input; 0 = none.
+        dt: distance of the rows, s.
+        substeps: per row.
+        lead: rows of the past.
+    """
+    rows = u.shape[0]
+    h = dt / substeps
+    integral = jnp.concatenate([jnp.zeros((1, u.shape[1])), jnp.cumsum(u, axis=0)]) * dt
+    edges = jnp.arange(rows * substeps + 1) * h
+
+    def one(total: Float[Array, " r"], first: Float[Array, ""], d: Float[Array, ""], tau: Float[Array, ""]) -> Array:
+        at = edges - d
+        position = jnp.clip(at / dt, 0.0, rows - 1e-9)
+        low = jnp.floor(position).astype(jnp.int32)
+        value = total[low] + (position - low) * (total[low + 1] - total[low])
+        value = value + jnp.minimum(at, 0.0) * first  # before the record the first input was held
+        mean = jnp.diff(value) / h
+        # exact answer of the lag to a staircase; its mean over a substep
+        ratio = h / jnp.maximum(tau, 1e-3 * h)
+        keep = jnp.exp(-ratio)
+
+        def join(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+            return a[0] * b[0], a[1] * b[0] + b[1]
+
+        _, ends = jax.lax.associative_scan(join, (jnp.full_like(mean, keep), (1 - keep) * mean))
+        ends = ends + jnp.exp(-ratio * jnp.arange(1, mean.shape[0] + 1)) * mean[0]  # settled before the record
+        before = jnp.concatenate([mean[:1], ends[:-1]])
+        return mean + (before - mean) * (1 - keep) / ratio
+
+    first = u[0]
+    every = jax.vmap(one, in_axes=(1, 0, 0, 0), out_axes=1)(integral, first, delay, lag)
+    return every.reshape(rows, substeps, -1)[lead:]

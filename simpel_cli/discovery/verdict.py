@@ -1,0 +1,236 @@
+"""What a search says in the end: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
+
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.data.recording import Check
+from simpel_cli.discovery.assess import Assessment, reduction_interval, results, rmse
+from simpel_cli.discovery.gate import Gate
+from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
+from simpel_cli.discovery.windows import Windows
+from simulators.effects import Term
+
+EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
+Z95 = 1.959963984540054
+
+
+def verdict_of(
+    search: Search,
+    selection: Selection,
+    gates: list[Gate],
+    before: Assessment,
+    after: Assessment,
+    windows: Windows,
+    checks: tuple[Check, ...],
+    horizon: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """Return `verdict.json`.
+
+    Args:
+        search: that was run.
+        selection: what it chose; terms that failed the gate are left out already.
+        gates: one per chosen term, in order.
+        before: the calibrated simulator on the test windows.
+        after: the corrected one.
+        windows: the test windows.
+        checks: of the data.
+        horizon: rows.
+        seconds: of the search.
+    """
+    chosen, terms = selection.chosen, search.terms
+    named = [
+        not any(terms[t.terms[-1]].depends_on for t in rivals) for rivals in selection.classes
+    ]  # not beaten by a function without a name
+    effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i, ok in enumerate(named) if ok]
+    remainder = _remainder(search, selection, named)
+    different = [_distinct(e) for e in effects]
+    if not effects:
+        kind = UNEXPLAINED if remainder else NONE
+    else:
+        kind = EFFECT if all(len(d) == 1 for d in different) else AMBIGUOUS
+    measured = search.plan.augmented.measured
+    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
+    found = {
+        "verdict": kind,
+        "summary": "",
+        "effects": effects,
+        "remainder": remainder,
+        "parameters": _parameters(search, selection.base, chosen),
+        "error": {
+            "split": "test",
+            "episodes": len(np.unique(windows.episode)),
+            "unit_note": "RMSE in data units, per measured output",
+            "before": results(before, measured, rows),
+            "after": results(after, measured, rows),
+            "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
+            "horizon_steps": horizon,
+        },
+        "noise_floor": dict(zip(measured, _noise(search, chosen)[0], strict=True)),
+        "process_noise": {"before": _noise(search, selection.base)[1], "after": _noise(search, chosen)[1]},
+        "gate": [g._asdict() for g in gates],
+        "not_found": _not_found(search, selection),
+        "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
+        "next_experiment": None,
+        "corrected_sim": None,
+        "candidates_tried": selection.tried,
+        "seconds": round(seconds, 2),
+    }
+    return found | {"summary": sentence(found, before, after, measured)}
+
+
+def interval_of(search: Search, trial: Trial, row: int) -> dict[str, float]:
+    """Return value and 95 % interval of one unknown of a fit, in its unit."""
+    coordinates, optimum = search.plan.coordinates, trial.optimum
+    at = optimum.z[row]
+    sd = float(np.sqrt(optimum.covariance[i, i])) if (i := _position(optimum.free, row)) is not None else 0.0
+    low, high = (float(np.clip(at + s * Z95 * sd, 0, 1)) for s in (-1, 1))
+    return {
+        "value": coordinates.value(row, at),
+        "low": coordinates.value(row, low),
+        "high": coordinates.value(row, high),
+    }
+
+
+def _position(free: tuple[int, ...], row: int) -> int | None:
+    return free.index(row) if row in free else None
+
+
+def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
+    term = search.terms[selection.chosen.terms[i]]
+    rows = search.rows[selection.chosen.terms[i]]
+    names = [term.effect] + [search.terms[t.terms[-1]].effect for t in selection.classes[i]]
+    places = {term.effect: term.acts_on} | {
+        search.terms[t.terms[-1]].effect: search.terms[t.terms[-1]].acts_on for t in selection.classes[i]
+    }
+    before = _noise(search, selection.base)[1]
+    after = _noise(search, selection.chosen)[1]
+    return {
+        "name": term.effect,
+        "acts_on": term.acts_on,
+        "meaning": term.meaning,
+        "class": list(dict.fromkeys(names)),
+        "class_acts_on": places,
+        "same_as": list(term.same_as),
+        "log_evidence_gain": selection.gains[i],
+        "held_out_gain": None if gate is None else gate._asdict(),
+        "parameters": {
+            knob.label: interval_of(search, selection.chosen, row) | {"unit": knob.unit}
+            for knob, row in zip(term.knobs, rows, strict=True)
+        },
+        "share_of_residual": float(1 - (after / before) ** 2) if before > 0 else 0.0,
+    }
+
+
+def _distinct(effect: dict[str, Any]) -> list[str]:
+    """Names of a class that some data could tell apart."""
+    return [n for n in effect["class"] if n == effect["name"] or n not in effect["same_as"]]
+
+
+def _remainder(search: Search, selection: Selection, named: list[bool]) -> dict[str, Any] | None:
+    beaten = [
+        next(t for t in rivals if search.terms[t.terms[-1]].depends_on)
+        for rivals, ok in zip(selection.classes, named, strict=True)
+        if not ok
+    ]
+    if beaten:
+        term: Term = search.terms[beaten[0].terms[-1]]
+        gain = beaten[0].optimum.log_evidence - selection.base.optimum.log_evidence
+    elif selection.remainder is not None:
+        term, gain = selection.remainder
+    else:
+        return None
+    scale = search.plan.scales.rate[term.acts_on]
+    level = _noise(search, selection.chosen)[1]
+    unit = term.knobs[0].unit
+    return {
+        "acts_on": term.acts_on,
+        "depends_on": list(term.depends_on),
+        "rms": level / np.sqrt(search.plan.augmented.model.dt),
+        "unit": unit,
+        "log_evidence_gain": gain,
+        "description": f"something acts on d({term.acts_on})/dt that depends on {', '.join(term.depends_on)} and is "
+        f"no effect of the catalogue (typical rate of the data: {scale:.3g} {unit})",
+    }
+
+
+def _parameters(search: Search, base: Trial, chosen: Trial) -> dict[str, Any]:
+    return {
+        q.name: {"before": interval_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
+        for i, q in enumerate(search.plan.augmented.model.params)
+    }
+
+
+def _noise(search: Search, trial: Trial) -> tuple[list[float], float]:
+    """Measurement noise per channel, and the largest process noise, per square root of a second."""
+    n_p, n_r, n_q = search.plan.coordinates.sizes
+    r, q = (
+        [search.plan.coordinates.value(i, trial.optimum.z[i]) for i in rows]
+        for rows in (range(n_p, n_p + n_r), range(n_p + n_r, n_p + n_r + n_q))
+    )
+    return r, max(q, default=0.0)
+
+
+def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
+    """Return the smallest size of every other effect that would have been seen: it earns ACCEPT nats."""
+    last = selection.stages[-1]
+    rows = []
+    for trial in last.trials:
+        term = search.terms[trial.terms[-1]]
+        if term.depends_on or trial.terms[:-1] != selection.chosen.terms:
+            continue
+        row = search.rows[trial.terms[-1]][0]
+        i = trial.optimum.free.index(row)
+        sd = float(np.sqrt(trial.optimum.covariance[i, i]))
+        occam = max(-np.log(sd * np.sqrt(2 * np.pi)), 0.0)
+        size = sd * np.sqrt(2 * (ACCEPT + occam))
+        knob = term.knobs[0]
+        span = search.plan.coordinates.high[row] - search.plan.coordinates.low[row]
+        if size < 1:
+            rows.append(
+                {"name": term.effect, "acts_on": term.acts_on, "parameter": knob.label,
+                 "smallest_detectable": float(size * span), "unit": knob.unit,
+                 "log_evidence_gain": trial.optimum.log_evidence - last.before.optimum.log_evidence}
+            )  # fmt: skip
+    return rows
+
+
+def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measured: tuple[str, ...]) -> str:
+    """Return the verdict as one sentence with numbers and units."""
+    first, second = rmse(before.ahead), rmse(after.ahead)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = first / second
+    best = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else 0
+    steps = found["error"]["horizon_steps"]
+    gain = f"The error {steps} rows ahead in {measured[best]} falls from {first[best]:.3g} to {second[best]:.3g}."
+    parts = [_phrase(e) for e in found["effects"]]
+    listed = " and ".join(parts)
+    match found["verdict"]:
+        case "effect":
+            rest = (
+                f" What is left depends on {', '.join(found['remainder']['depends_on'])}." if found["remainder"] else ""
+            )
+            return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
+        case "ambiguous":
+            tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
+            names = " or ".join(n.replace("_", " ") for n in _distinct(tied))
+            also = (
+                f" Besides: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
+                if len(parts) > 1
+                else ""
+            )
+            return f"Causes that fit these data equally well: {names}.{also} {gain}"
+        case "unexplained":
+            return f"The simulator lacks something without a name: {found['remainder']['description']}."
+        case _:
+            return "Nothing is missing that these data could show: the calibrated simulator explains them."
+
+
+def _phrase(effect: dict[str, Any]) -> str:
+    values = ", ".join(
+        f"{name} = {p['value']:.3g} ({p['low']:.3g}..{p['high']:.3g}) {p['unit']}"
+        for name, p in effect["parameters"].items()
+    )
+    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values})"

@@ -1,0 +1,82 @@
+"""Measured episodes as one padded, masked batch of windows of equal length."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode
+
+LONGEST = 256  # rows of a window: a longer record is cut, and its windows run side by side
+LONGEST_TEST = 2048  # of a window on which free runs are judged
+
+
+class Windows(NamedTuple):
+    """W windows of T rows; a row that is padding or not measured does not count.
+
+    Args:
+        y: (W, T, ny) measurements, 0 where they do not count.
+        ok: (W, T, ny) 1 where a measurement counts, else 0.
+        u: (W, lead + T, nu) inputs, held from a row to the next, with `lead` rows of the past in front.
+        start: (W, nx) guess of the first state.
+        episode: (W,) index of the episode, in the order given.
+    """
+
+    y: np.ndarray
+    ok: np.ndarray
+    u: np.ndarray
+    start: np.ndarray
+    episode: np.ndarray
+
+
+def windows_of(
+    episodes: Sequence[Episode],
+    states: Sequence[str],
+    measured: Sequence[str],
+    outputs: Sequence[str],
+    centre: np.ndarray,
+    *,
+    lead: int,
+    at_least: int = 1,
+    longest: int = LONGEST,
+) -> Windows:
+    """Cut episodes into windows.
+
+    Args:
+        episodes: contiguous rows at the model's dt.
+        states: names of the model's states.
+        measured: names of the measured channels.
+        outputs: names of the columns of `Episode.outputs`.
+        centre: (nx,) guess of a state that no channel measures.
+        lead: rows of past input that delays and lags look back on; before the record the first input is assumed.
+        at_least: windows per episode, so that few episodes can be held out in parts.
+        longest: rows of a window.
+    """
+    rows_of_longest = max(len(e.time) for e in episodes)
+    pieces = max(at_least, -(-rows_of_longest // longest))
+    length = -(-rows_of_longest // pieces)
+    rows: dict[str, list[np.ndarray]] = {"y": [], "ok": [], "u": [], "start": [], "episode": []}
+    for index, episode in enumerate(episodes):
+        columns = [
+            episode.states[:, list(states).index(n)] if n in states else episode.outputs[:, list(outputs).index(n)]
+            for n in measured
+        ]
+        y = np.stack(columns, axis=1)
+        past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
+        for begin in range(0, len(y), length):
+            part = y[begin : begin + length]
+            if len(part) < 3:
+                continue
+            ok = np.isfinite(part)
+            missing = length - len(part)
+            rows["ok"].append(np.pad(ok.astype(float), ((0, missing), (0, 0))))
+            rows["y"].append(np.pad(np.where(ok, part, 0.0), ((0, missing), (0, 0))))
+            u = past[begin : begin + lead + len(part)]
+            rows["u"].append(np.pad(np.nan_to_num(u), ((0, missing), (0, 0)), mode="edge"))
+            start = np.array(centre, float)
+            for j, name in enumerate(measured):
+                if name in states and ok[0, j]:
+                    start[list(states).index(name)] = part[0, j]
+            rows["start"].append(start)
+            rows["episode"].append(np.array(index))
+    return Windows(*(np.stack(rows[name]) for name in Windows._fields))

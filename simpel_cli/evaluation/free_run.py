@@ -1,0 +1,121 @@
+"""Free runs: the posterior runs on its own predictions along measured inputs."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode
+from simpel_cli.encoding import Encoding
+from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
+from simpel_cli.evaluation.posterior import Posterior, noise_of
+from simpel_cli.inference import padded_length
+
+
+class FreeRun(NamedTuple):
+    """Roll-outs of the posterior along measured inputs, from W windows of test episodes, in physical units."""
+
+    measured: np.ndarray  # (W, H + 1, ds)
+    mean: np.ndarray  # (W, H + 1, ds)
+    std: np.ndarray  # (W, H + 1, ds), between particles and with observation noise
+    episode: np.ndarray  # (W,)
+    row: np.ndarray  # (W,) first row in the episode
+    error: np.ndarray  # (W, H + 1, ds), angles wrapped
+
+
+def windows(episodes: tuple[Episode, ...], horizon: int, first: int) -> list[tuple[int, int]]:
+    """Return (episode, first row) of roll-out windows, half overlapping; `first` rows of history come before each."""
+    starts = []
+    for i, episode in enumerate(episodes):
+        starts += [(i, s) for s in range(first, len(episode.states) - horizon, max(horizon // 2, 1))]
+    return starts
+
+
+def free_run(posterior: Posterior, encoding: Encoding, episodes: tuple[Episode, ...], horizon: int) -> FreeRun | None:
+    """Roll the posterior out from measured states; each particle follows its own path (trajectory sampling TS-infinity).
+
+    Reference: Chua, Calandra, McAllister and Levine (2018), Deep reinforcement learning in a handful of trials.
+
+    Args:
+        posterior: the fitted posterior.
+        encoding: coordinates.
+        episodes: measured test episodes.
+        horizon: steps of a roll-out.
+
+    Returns:
+        None if no episode is long enough.
+    """
+    k = encoding.stack
+    starts = windows(episodes, horizon, k)
+    if not starts or not encoding.states:
+        return None
+    measured = np.stack([episodes[e].states[s : s + horizon + 1] for e, s in starts])
+    inputs = np.stack([_stacked(episodes[e].inputs, s, horizon, k) for e, s in starts])  # (W, H, (k+1) du)
+    particles, noise = rollout(posterior, encoding, measured[:, 0], inputs)  # (H + 1, L, W, ds)
+    mean, spread = _circular_moments(particles, encoding)
+    std = np.sqrt(spread**2 + noise**2)
+    mean, std = np.moveaxis(mean, 0, 1), np.moveaxis(std, 0, 1)
+    error = mean - measured
+    periodic = np.array([q.periodic for q in encoding.states])
+    error = np.where(periodic, (error + np.pi) % (2 * np.pi) - np.pi, error)
+    first = np.array(starts)
+    return FreeRun(measured, mean, std, first[:, 0], first[:, 1], error)
+
+
+def rollout(
+    posterior: Posterior, encoding: Encoding, states: np.ndarray, inputs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Roll every particle out along measured inputs.
+
+    Args:
+        posterior: the fitted posterior.
+        encoding: coordinates.
+        states: initial states, shape (W, ds).
+        inputs: stacked inputs, shape (W, H, (stack + 1) du).
+
+    Returns:
+        States of every particle (H + 1, L, W, ds), physical units, and the noise per state (ds,).
+    """
+    w = len(states)
+    noise = noise_of(posterior, encoding)
+    encoded = np.broadcast_to(encoding.encode(states)[None], (posterior.particles, w, encoding.dim_state))
+    path = [encoded]
+    for h in range(inputs.shape[1]):
+        along = np.broadcast_to(inputs[None, :, h], (posterior.particles, w, inputs.shape[2]))
+        x = np.concatenate([encoded, along], axis=-1)
+        pad = padded_length(w) - w  # test sets of similar size share a program
+        y = np.asarray(posterior.members(np.pad(x, [(0, 0), (0, pad), (0, 0)], mode="edge")), dtype=float)[:, :w]
+        encoded = encoding.advance(encoded, y)
+        path.append(encoded)
+    per_state, i = [], 0
+    for q in encoding.states:
+        # an angle's variance is the sum of those of its sine, s^2 cos^2, and cosine, s^2 sin^2
+        per_state.append(np.hypot(noise[i], noise[i + 1]) if q.periodic else noise[i])
+        i += 2 if q.periodic else 1
+    return encoding.decode(np.stack(path)), np.array(per_state)
+
+
+def _circular_moments(particles: np.ndarray, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation over particles (axis 1); directions are averaged on the circle."""
+    mean, std = particles.mean(axis=1), particles.std(axis=1)
+    for i, q in enumerate(encoding.states):
+        if q.periodic:
+            angle = particles[..., i]
+            middle = np.arctan2(np.sin(angle).mean(axis=1), np.cos(angle).mean(axis=1))
+            off = (angle - middle[:, None] + np.pi) % (2 * np.pi) - np.pi
+            mean[..., i], std[..., i] = middle, np.sqrt((off**2).mean(axis=1))
+    return mean, std
+
+
+def _stacked(inputs: np.ndarray, start: int, horizon: int, k: int) -> np.ndarray:
+    return np.concatenate([inputs[start - k + j : start - k + j + horizon] for j in range(k + 1)], axis=1)
+
+
+def free_run_table(run: FreeRun, blocks: Blocks, encoding: Encoding, dt: float) -> list[dict[str, object]]:
+    """Return metric rows `free_run_rmse@<horizon>s` per state at a quarter, half and the whole of the horizon."""
+    horizon = run.error.shape[1] - 1
+    rows: list[dict[str, object]] = []
+    for h in sorted({max(1, horizon // 4), max(1, horizon // 2), horizon}):
+        for i, q in enumerate(encoding.states):
+            estimate = bootstrap(run.error[:, h, i] ** 2, blocks, np.sqrt)
+            rows += interval_rows(f"free_run_rmse@{h * dt:g}s", q.name, q.unit, estimate)
+    return rows

@@ -1,0 +1,197 @@
+"""Figures of a run."""
+
+from collections import Counter, defaultdict
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.plots.canvas import (
+    BLACK,
+    COLOURS,
+    columns_of,
+    distinct,
+    legend_below,
+    legend_beside,
+    line_style,
+    new_figure,
+    save,
+    with_unit,
+)
+from simpel_cli.records import read_metrics
+
+MOST_POINTS = 200  # of a panel: more of them is a band of ink
+
+
+def draw_run(directory: Path) -> list[Path]:
+    """Draw every figure whose Parquet file is there; returns their paths."""
+    figures = [
+        (_learning_curves, directory / "metrics.parquet", "learning_curves"),
+        (_predictions, directory / "predictions.parquet", "predictions"),
+        (_calibration, directory / "calibration.parquet", "calibration"),
+        (_horizon, directory / "horizon.parquet", "free_run"),
+        (_example, directory / "trajectories.parquet", "free_run_example"),
+    ]
+    drawn = []
+    for draw, source, name in figures:
+        if source.is_file():
+            figure = draw(source)
+            if figure is not None:
+                drawn.append(save(figure, directory / f"{name}.png"))
+    return drawn
+
+
+def _learning_curves(path: Path) -> Any:
+    rows = [r for r in read_metrics(path) if r["split"] == "train"]
+    if not rows:
+        return None
+    outputs = distinct(r["output"] for r in rows if r["metric"] == "noise_std")
+    figure, (loss, noise) = new_figure(2, beside=len(outputs))
+    for i, seed in enumerate(distinct(r["seed"] for r in rows)):
+        own = [r for r in rows if r["seed"] == seed]
+        curve = [(r["step"], r["value"]) for r in own if r["metric"] == "loss"]
+        loss.plot(*zip(*curve, strict=True), color=COLOURS[0], alpha=0.9 if i == 0 else 0.4, linewidth=1)
+        for j, output in enumerate(outputs):
+            line = [(r["step"], r["value"]) for r in own if r["metric"] == "noise_std" and r["output"] == output]
+            unit = next(r["unit"] for r in own if r["metric"] == "noise_std" and r["output"] == output)
+            label = with_unit(output, unit) if i == 0 else None
+            noise.plot(*zip(*line, strict=True), **line_style(j), alpha=0.9 if i == 0 else 0.4, label=label)
+    loss.set(
+        title=f"training{_of_seeds(rows[0]['seed'], {r['seed'] for r in rows})}",
+        xlabel="step",
+        ylabel="NLL per point [nat]",
+    )
+    # the fall of the first steps is not what one looks for: scale the axis to what follows
+    late = [r["value"] for r in rows if r["metric"] == "loss" and r["step"] >= 0.05 * rows[-1]["step"]]
+    margin = 0.05 * (max(late) - min(late)) + 1e-9
+    loss.set_ylim(min(late) - margin, max(late) + margin)
+    noise.set(title="learned noise", xlabel="step", ylabel="standard deviation", yscale="log")
+    legend_beside(noise)
+    return figure
+
+
+def _of_seeds(first: int, seeds: Collection[int]) -> str:
+    """Say which seed the strong lines are of, where there are several."""
+    return f", seed {first} (others pale)" if len(seeds) > 1 else ""
+
+
+def _predictions(path: Path) -> Any:
+    """Measured and predicted targets of the first seed: along the longest test segment, or against each other."""
+    table = columns_of(path)
+    first = table["seed"] == table["seed"][0]
+    pieces = Counter(zip(table["episode"][first], table["segment"][first], strict=True))
+    (episode, segment), _ = pieces.most_common(1)[0]
+    along = first & (table["episode"] == episode) & (table["segment"] == segment)
+    in_time = _follow(table["time"][along & (table["output"] == table["output"][0])], table["kind"])
+    outputs = distinct(table["output"])
+    figure, axes = new_figure(len(outputs))
+    for axis, output in zip(axes, outputs, strict=True):
+        own = (along if in_time else first) & (table["output"] == output)
+        order = np.argsort(table["time"][own], kind="stable")[:MOST_POINTS]
+        shown = {name: column[own][order] for name, column in table.items()}
+        axis.set_title(output)
+        what = "change in one step" if shown["kind"][0] == "change" else "value"
+        (_along_time if in_time else _against_each_other)(axis, shown, with_unit(what, shown["unit"][0]))
+    legend_below(figure, axes[0])
+    return figure
+
+
+def _follow(time: np.ndarray, kinds: np.ndarray) -> bool:
+    """Whether rows are a course in time: those of a simulator without states, or in no order, are not."""
+    steps = np.diff(np.sort(time))
+    return "change" in kinds and len(steps) > 1 and bool(steps.min() > 0 and steps.max() < 1.5 * np.median(steps))
+
+
+def _along_time(axis: Any, shown: dict[str, np.ndarray], label: str) -> None:
+    t, mean, std, between = (shown[c] for c in ("time", "mean", "std", "epistemic_std"))
+    axis.fill_between(t, mean - 2 * std, mean + 2 * std, color=COLOURS[0], alpha=0.15, label="±2 std, total")
+    axis.fill_between(t, mean - 2 * between, mean + 2 * between, color=COLOURS[0], alpha=0.35, label="±2 std, model")
+    axis.plot(t, mean, color=COLOURS[0], linewidth=1.2, label="predicted")
+    axis.plot(t, shown["measured"], ".", color=COLOURS[1], markersize=3, label="measured")
+    axis.set(xlabel="time [s]", ylabel=label)
+
+
+def _against_each_other(axis: Any, shown: dict[str, np.ndarray], label: str) -> None:
+    measured, mean, std = (shown[c] for c in ("measured", "mean", "std"))
+    ends = [measured.min(), measured.max()]
+    axis.plot(ends, ends, color="0.6", linewidth=1, linestyle="--", label="as measured")
+    style = {"fmt": ".", "color": COLOURS[0], "ecolor": "#9CC7E1", "elinewidth": 1, "markersize": 4}
+    axis.errorbar(measured, mean, yerr=2 * std, label="predicted, ±2 std, total", **style)
+    axis.set(xlabel=f"measured {label}", ylabel=f"predicted {label}")
+
+
+def _calibration(path: Path) -> Any:
+    table = columns_of(path)
+    outputs = distinct(table["output"])
+    figure, (axis,) = new_figure(1, 3.6, 3.4, beside=len(outputs))
+    axis.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--")
+    for j, output in enumerate(outputs):
+        own = table["output"] == output
+        levels = np.unique(table["level"][own])
+        fraction = [table["fraction"][own & (table["level"] == level)].mean() for level in levels]
+        style = {"color": BLACK, "linewidth": 2.0} if output == "joint" else line_style(j) | {"linewidth": 1.2}
+        axis.plot(levels, fraction, label=output, **style)
+    axis.set(
+        title="calibration",
+        xlabel="stated probability",
+        ylabel="share of test targets inside",
+        xlim=(0, 1),
+        ylim=(0, 1),
+    )
+    axis.text(0.97, 0.05, "below the diagonal: overconfident", ha="right", fontsize=7, color="0.4")
+    legend_beside(axis)
+    return figure
+
+
+def _horizon(path: Path) -> Any:
+    table = columns_of(path)
+    outputs, seeds = distinct(table["output"]), distinct(table["seed"].tolist())
+    figure, axes = new_figure(len(outputs))
+    for axis, output in zip(axes, outputs, strict=True):
+        for i, seed in enumerate(seeds):
+            own = (table["output"] == output) & (table["seed"] == seed)
+            alpha = 0.9 if i == 0 else 0.4
+            label = (f"error (RMSE){_of_seeds(seed, seeds)}", "claimed std") if i == 0 else (None, None)
+            axis.plot(table["horizon"][own], table["rmse"][own], color=COLOURS[1], alpha=alpha, label=label[0])
+            axis.plot(
+                table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1]
+            )
+        unit = table["unit"][table["output"] == output][0]
+        axis.set(title=output, xlabel="time ahead [s]", ylabel=with_unit("free run", unit), ylim=(0, None))
+    legend_below(figure, axes[0])
+    return figure
+
+
+def _example(path: Path) -> Any:
+    """Measured and predicted course of the first seed's free run whose error is the median of all."""
+    table = columns_of(path)
+    table = {name: column[table["seed"] == table["seed"][0]] for name, column in table.items()}
+    runs = list(zip(table["episode"], table["segment"], table["start"], strict=True))
+    typical = _median_run(runs, table)
+    outputs = distinct(table["output"])
+    figure, axes = new_figure(len(outputs))
+    chosen = np.array([run == typical for run in runs])
+    for axis, output in zip(axes, outputs, strict=True):
+        own = chosen & (table["output"] == output)
+        t, mean, std, measured = (table[c][own] for c in ("time", "mean", "std", "measured"))
+        axis.fill_between(t, mean - 2 * std, mean + 2 * std, color=COLOURS[0], alpha=0.2, label="±2 std")
+        axis.plot(t, mean, color=COLOURS[0], linewidth=1.2, label="free run")
+        axis.plot(t, measured, ".", color=COLOURS[1], markersize=4, label="measured")
+        axis.set(title=output, xlabel="time [s]", ylabel=with_unit("value", table["unit"][own][0]))
+    legend_below(figure, axes[0])
+    count = len(set(runs))
+    figure.suptitle(f"episode {typical[0]} from {typical[2]:.4g} s: the median error of {count} free runs", fontsize=9)
+    return figure
+
+
+def _median_run(runs: list[tuple[Any, ...]], table: dict[str, np.ndarray]) -> tuple[Any, ...]:
+    """Return the run in the middle, by squared error relative to that of all runs, summed over outputs."""
+    squared = (table["mean"] - table["measured"]) ** 2
+    for output in distinct(table["output"]):
+        own = table["output"] == output
+        squared[own] /= max(squared[own].mean(), np.finfo(float).tiny)
+    total: dict[tuple[Any, ...], float] = defaultdict(float)
+    for run, value in zip(runs, squared, strict=True):
+        total[run] += value
+    return sorted(total, key=lambda run: total[run])[(len(total) - 1) // 2]

@@ -1,0 +1,8 @@
+"""Physical effects that a simulator may lack. The catalogue is `conf/effect/`: one YAML each."""
+
+from simulators.effects.expression import Expression, Scales
+from simulators.effects.structure import Structure, structure
+from simulators.effects.term import Knob, Term
+from simulators.effects.unnamed import unnamed
+
+__all__ = ["Expression", "Knob", "Scales", "Structure", "Term", "structure", "unnamed"]

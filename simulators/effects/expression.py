@@ -1,0 +1,236 @@
+"""An effect written as an expression: every effect of the catalogue, and a user's own, is one YAML file of this form."""
+
+import ast
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import casadi
+
+from simulators.effects.structure import structure
+from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR, Knob, Term
+from simulators.expression import RESERVED, parse
+from simulators.model import Model, ModelError
+
+ROLES = ("velocity", "angle_velocity", "first_order", "input", "measured", "measured_angle")
+KIND_OF_ROLE = {"velocity": RATE, "angle_velocity": RATE, "first_order": RATE, "input": INPUT}
+
+
+class Scales(NamedTuple):
+    """How large things are in the measurements: what the ranges of effects are stated in.
+
+    Args:
+        size: quantity -> largest magnitude (a periodic state: pi).
+        rate: state -> typical magnitude of its rate, per second.
+        dt: distance of the rows, s.
+    """
+
+    size: dict[str, float]
+    rate: dict[str, float]
+    dt: float
+
+
+@dataclass(frozen=True)
+class Expression:
+    """An effect as a term in the names of the model.
+
+    Args:
+        name: of the effect.
+        meaning: one physical sentence.
+        acts_on: where: roles (velocity, angle_velocity, first_order, input, measured, measured_angle) or names of
+            states, inputs and measured quantities.
+        term: what is added to the rate of a state, or what stands in place of an input or a measured quantity. Roles can
+            be used for names: `v` the velocity acted on, `s` its position, `x` the first-order state, `other` another
+            state of the same unit, `u` the input, `y` the measured quantity, `rate` the model's own rate.
+        operator: in place of `term`: delay, lag or sensor_delay, on the signal that it acts on; its one parameter is s.
+        kind: rate, input or sensor, where `acts_on` names quantities; found from the model if left out.
+        parameters: name -> {range: [low, high], unit, neutral: 0, starts: [...]}. Numbers, or expressions of the scales A
+            (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`.
+        same_as: effects that no data can tell from this one.
+        generalises: effects that it becomes when some of its parameters are neutral.
+        dissipative: it never adds energy (tested).
+    """
+
+    name: str
+    meaning: str = ""
+    acts_on: Any = ()
+    term: str = ""
+    operator: str = ""
+    kind: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    same_as: tuple[str, ...] = ()
+    generalises: tuple[str, ...] = ()
+    dissipative: bool = False
+
+    def __post_init__(self) -> None:
+        where = f"effect.{self.name}"
+        if not self.places:
+            raise ModelError(f"{where}.acts_on: empty; name a role ({', '.join(ROLES)}) or quantities of the simulator")
+        if bool(self.term) == bool(self.operator):
+            raise ModelError(f"{where}: give either `term` or `operator` ({', '.join(OPERATORS)})")
+        if self.operator and (self.operator not in OPERATORS or len(self.parameters) != 1):
+            raise ModelError(
+                f"{where}.operator: {self.operator!r} with {len(self.parameters)} parameters; allowed are "
+                f"{', '.join(OPERATORS)} with one parameter, a time in s"
+            )
+        for name, node in self.parameters.items():
+            if not (
+                isinstance(node, Mapping) and isinstance(node.get("range"), list | tuple) and len(node["range"]) == 2
+            ):
+                raise ModelError(
+                    f"{where}.parameters.{name}: {node!r} has no range; write {{range: [low, high], unit: ...}}"
+                )
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Roles or names, as given."""
+        return (self.acts_on,) if isinstance(self.acts_on, str) else tuple(self.acts_on)
+
+    def attach(self, model: Model, scales: Scales, measured: tuple[str, ...]) -> list[Term]:
+        """Return a term for every place of the model where the effect can act; none where the model has no such place.
+
+        Args:
+            model: the simulator.
+            scales: magnitudes of its quantities in the measurements.
+            measured: names of the measured states and outputs.
+
+        Raises:
+            ModelError: a place or a name in the term that the model does not have.
+        """
+        roles = structure(model)
+        units = {q.name: q.unit for q in (*model.states, *model.inputs, *model.outputs)}
+        periodic = {q.name for q in model.states if q.periodic}
+        angles = periodic | {n for n, u in units.items() if u == "rad"}
+        members = {
+            "velocity": tuple(roles.velocity),
+            "angle_velocity": tuple(v for v, s in roles.velocity.items() if s in angles),
+            "first_order": roles.first_order,
+            "input": tuple(q.name for q in model.inputs),
+            "measured": measured,
+            "measured_angle": tuple(n for n in measured if n in angles),
+        }
+        terms = []
+        for place in self.places:
+            if place not in members and place not in units:
+                raise ModelError(
+                    f"effect.{self.name}.acts_on: {place!r} is no role and no quantity of {model.name}; roles: "
+                    f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
+                )
+            for name in members.get(place, (place,)):
+                terms += self._at(name, model, scales, roles.velocity.get(name), units, place)
+        return terms
+
+    def _at(
+        self, name: str, model: Model, scales: Scales, position: str | None, units: dict[str, str], place: str
+    ) -> list[Term]:
+        states = [q.name for q in model.states]
+        kind = self.operator or self.kind or KIND_OF_ROLE.get(place) or _kind(name, model, place)
+        names = _names(self.term) if self.term else set()
+        if ("s" in names and position is None and "s" not in units) or (
+            "S" in str(self.parameters) and position is None
+        ):
+            return []
+        periodic = {q.name for q in model.states if q.periodic}
+        others = [n for n in states if n != name and units[n] == units[name]] if "other" in names else [""]
+        own = {"v": name, "x": name, "u": name, "y": name} | ({"s": position} if position else {})
+        size = scales.size
+        values = {
+            "A": scales.rate.get(name, 1.0),
+            "V": size[name], "X": size[name], "U": size[name], "Y": size[name],
+            "S": size[position] if position else 1.0,
+            "dt": scales.dt,
+        }  # fmt: skip
+        unit = units[name]
+        unit_of = {"A": per(unit, "s"), "V": unit, "X": unit, "U": unit, "Y": unit, "S": units.get(position or "", "")}
+        if position in periodic:
+            values["S"] = 3.141592653589793
+        found = []
+        for other in others:
+            prefix = f"{self.name}_{name}" + (f"_{other}" if other else "")
+            knobs = []
+            for label, node in self.parameters.items():
+                low, high = (_value(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
+                null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
+                given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
+                starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
+                knobs.append(
+                    Knob(f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts)
+                )
+            swap = own | {"other": other} | {k.label: k.name for k in knobs}
+            text = _renamed(self.term, {k: v for k, v in swap.items() if v is not None}) if self.term else ""
+            found.append(
+                Term(
+                    self.name,
+                    name,
+                    kind,
+                    text,
+                    tuple(knobs),
+                    self.meaning,
+                    tuple(self.same_as),
+                    tuple(self.generalises),
+                    self.dissipative,
+                )
+            )
+        return found
+
+
+def _kind(name: str, model: Model, place: str) -> str:
+    if place in ("measured", "measured_angle"):
+        return SENSOR
+    if any(q.name == name for q in model.inputs):
+        return INPUT
+    return RATE if any(q.name == name for q in model.states) else SENSOR
+
+
+def _names(text: str) -> set[str]:
+    return {node.id for node in ast.walk(ast.parse(text, mode="eval")) if isinstance(node, ast.Name)} - RESERVED
+
+
+def _renamed(text: str, swap: Mapping[str, str]) -> str:
+    """Replace whole names in an expression."""
+    return re.sub(r"(?<![\w.])[A-Za-z_]\w*", lambda m: swap.get(m[0], m[0]), text)
+
+
+def _value(value: Any, scales: Mapping[str, float], path: str) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    try:
+        return float(parse(str(value), {name: casadi.SX(scale) for name, scale in scales.items()}))
+    except ValueError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def _unit(text: str, units: Mapping[str, str]) -> str:
+    """Work out a unit written in scales, `A/V`, in the units of the model: powers of base words are cancelled."""
+    powers: dict[str, int] = {}
+    for sign, factor in re.findall(r"([*/]?)\s*([^*/]+)", text):
+        base, _, exponent = factor.strip().partition("^")
+        power = (-1 if sign == "/" else 1) * int(exponent or 1)
+        _collect(units.get(base, base), power, powers)
+    return _written(powers)
+
+
+def per(unit: str, other: str) -> str:
+    """Return the unit of a quotient, e.g. `rad/s^2` for rad/s over s."""
+    powers: dict[str, int] = {}
+    _collect(unit, 1, powers)
+    _collect(other, -1, powers)
+    return _written(powers)
+
+
+def _collect(unit: str, power: int, powers: dict[str, int]) -> None:
+    upper, *lower = unit.replace("(", "").replace(")", "").split("/")
+    for part, sign in ((upper, 1), *((p, -1) for p in lower)):
+        for word in part.split():
+            base, _, exponent = word.partition("^")
+            if base not in ("", "1", "-"):
+                powers[base] = powers.get(base, 0) + sign * power * int(exponent or 1)
+
+
+def _written(powers: Mapping[str, int]) -> str:
+    def words(sign: int) -> str:
+        return " ".join(b + (f"^{abs(n)}" if abs(n) > 1 else "") for b, n in powers.items() if n * sign > 0)
+
+    upper, lower = words(1) or "1", words(-1)
+    return f"{upper}/{lower}" if lower and " " not in lower else f"{upper}/({lower})" if lower else upper

@@ -1,0 +1,86 @@
+"""Where effects can act, read off a model: velocity rows with their positions, first-order rows, kinematic rows."""
+
+from typing import NamedTuple
+
+import casadi
+import numpy as np
+
+from simulators.model import Model
+
+
+class Structure(NamedTuple):
+    """Roles of a model's states.
+
+    Args:
+        kinematic: rates that hold by definition (a position's rate is a velocity); no force acts there.
+        velocity: rates that forces act on -> the state that this one is the rate of, or None where there is none.
+        first_order: all other rates: levels, temperatures, concentrations.
+    """
+
+    kinematic: tuple[str, ...]
+    velocity: dict[str, str | None]
+    first_order: tuple[str, ...]
+
+    @property
+    def dynamic(self) -> tuple[str, ...]:
+        """States whose rate may lack something."""
+        return (*self.velocity, *self.first_order)
+
+
+def structure(model: Model) -> Structure:
+    """Read the roles off the right-hand side and the units.
+
+    A rate is kinematic if it is another state itself, or depends on states alone, one of which has its unit. A state is
+    a velocity if a kinematic rate depends on it and it has that rate's unit, or if its unit is one of m/s and rad/s.
+    """
+    x, u, p = (
+        casadi.SX.sym(n, len(g), 1) for n, g in zip("xup", (model.states, model.inputs, model.params), strict=True)
+    )
+    rates = model.function()(x, u, p)[0]
+    on_x, on_u, on_p = (_depends(rates, symbol) for symbol in (x, u, p))
+    units = [_plain(q.unit) for q in model.states]
+    identity = _identities(model)
+    kinematic: dict[int, int] = {}
+    for i in range(len(model.states)):
+        if on_p[i].any() or on_u[i].any():
+            continue
+        of_rate = [j for j in np.flatnonzero(on_x[i]) if j != i and (units[j] and units[j] == _plain(f"{units[i]}/s"))]
+        source = of_rate[0] if of_rate else identity.get(i)
+        if source is not None:
+            kinematic[i] = int(source)
+    names = [q.name for q in model.states]
+    position = {j: i for i, j in kinematic.items() if identity.get(i) == j}
+    velocity, first = {}, []
+    for j, name in enumerate(names):
+        if j in kinematic:
+            continue
+        if j in kinematic.values() or units[j] in ("m/s", "rad/s"):
+            velocity[name] = names[position[j]] if j in position else None
+        else:
+            first.append(name)
+    return Structure(tuple(names[i] for i in kinematic), velocity, tuple(first))
+
+
+def _depends(rates: casadi.SX, symbol: casadi.SX) -> np.ndarray:
+    if symbol.numel() == 0:
+        return np.zeros((rates.numel(), 0), bool)
+    return np.array(casadi.DM(casadi.jacobian_sparsity(rates, symbol), 1).full(), bool)
+
+
+def _identities(model: Model) -> dict[int, int]:
+    """Rows whose rate is exactly another state."""
+    function = model.function()
+    random = np.random.default_rng(0)
+    sizes = [len(model.states), len(model.inputs), len(model.params)]
+    found: dict[int, int] = {}
+    points = [[random.uniform(0.5, 1.5, n) for n in sizes] for _ in range(3)]
+    rates = [np.asarray(function(*point)[0]).ravel() for point in points]
+    for i in range(sizes[0]):
+        for j in range(sizes[0]):
+            if i != j and all(rate[i] == point[0][j] for rate, point in zip(rates, points, strict=True)):
+                found[i] = j
+    return found
+
+
+def _plain(unit: str) -> str:
+    return unit.replace(" ", "")

@@ -1,0 +1,57 @@
+"""What an effect adds to a model: one term at one place, with its own unknown parameters."""
+
+from typing import NamedTuple
+
+RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
+DELAY, LAG, SENSOR_DELAY = "delay", "lag", "sensor_delay"  # operators on a signal, which no expression can state
+OPERATORS = (DELAY, LAG, SENSOR_DELAY)
+
+
+class Knob(NamedTuple):
+    """One unknown parameter of an effect, in the model's units.
+
+    At `neutral` the effect is switched off: the model is what it was without it.
+    """
+
+    name: str  # unique in the model with every effect attached
+    label: str  # as the effect calls it
+    unit: str
+    low: float
+    high: float
+    neutral: float
+    starts: tuple[float, ...]
+    prior: str = "uniform"
+
+
+class Term(NamedTuple):
+    """One effect at one place.
+
+    Args:
+        effect: its name.
+        acts_on: the state whose rate it changes, the input or the measured quantity that it alters.
+        kind: RATE, INPUT, SENSOR or one of OPERATORS.
+        expression: in the names of the model and of the knobs; empty for operators. RATE adds it to the rate; INPUT
+            and SENSOR put it in place of the quantity.
+        knobs: its parameters.
+        meaning: one physical sentence.
+        same_as: names of effects that no data can tell from this one.
+        generalises: effects that it becomes when some of its knobs are neutral.
+        dissipative: it never adds energy.
+        depends_on: arguments of a function without a physical name; empty for named effects.
+    """
+
+    effect: str
+    acts_on: str
+    kind: str
+    expression: str
+    knobs: tuple[Knob, ...]
+    meaning: str
+    same_as: tuple[str, ...] = ()
+    generalises: tuple[str, ...] = ()
+    dissipative: bool = False
+    depends_on: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Name and place, e.g. `coulomb_friction on omega`."""
+        return f"{self.effect} on {self.acts_on}"

@@ -1,0 +1,58 @@
+"""Functions without a physical name: what SimPEL's gap GP says, as hypotheses that a named effect has to beat.
+
+    f(a) = sum_j w_j phi_j(a),    w_j ~ N(0, S(omega_j)),    phi_j the sines of a box somewhat wider than the data
+
+Reference: Solin and Sarkka (2020), Hilbert space methods for reduced-rank Gaussian process regression, eq. 16.
+"""
+
+import math
+
+from simulators.effects.expression import Scales, per
+from simulators.effects.structure import structure
+from simulators.effects.term import RATE, Knob, Term
+from simulators.model import Model
+
+BASES = 6
+BOX = 1.3  # half width, in largest magnitudes of the argument
+LENGTHSCALE = 0.6  # of the GP, likewise
+AMPLITUDE = 0.3  # of the GP, in typical rates
+
+
+def unnamed(model: Model, scales: Scales) -> list[Term]:
+    """Return one function of each state and each input, for every rate that something may be missing from."""
+    terms = []
+    units = {q.name: q.unit for q in model.states}
+    periodic = {q.name for q in model.states if q.periodic}
+    arguments = [q.name for q in (*model.states, *model.inputs)]
+    for name in structure(model).dynamic:
+        for argument in arguments:
+            if scales.size[argument] <= 0:
+                continue
+            prefix = f"unnamed_{name}_of_{argument}_w"
+            amplitude = AMPLITUDE * scales.rate[name]
+            waves, shares = _harmonics(argument) if argument in periodic else _sines(argument, scales.size[argument])
+            knobs = tuple(
+                Knob(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
+                for j, sd in enumerate((amplitude * share for share in shares), start=1)
+            )
+            text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(knobs, waves, strict=True))
+            meaning = f"some function of {argument}"
+            terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,)))
+    return terms
+
+
+def _sines(argument: str, size: float) -> tuple[list[str], list[float]]:
+    box, length = BOX * size, LENGTHSCALE * size
+    waves, shares = [], []
+    for j in range(1, BASES + 1):
+        frequency = math.pi * j / (2 * box)
+        waves.append(f"sin({frequency:.6g}*({argument} + {box:.6g}))")
+        density = math.sqrt(2 * math.pi) * length * math.exp(-((frequency * length) ** 2) / 2)
+        shares.append(math.sqrt(density / box))
+    return waves, shares
+
+
+def _harmonics(angle: str) -> tuple[list[str], list[float]]:
+    """Sines and cosines of an angle: a periodic GP."""
+    waves = [f"{f}({j}*{angle})" for j in range(1, BASES // 2 + 1) for f in ("sin", "cos")]
+    return waves, [1 / j for j in range(1, BASES // 2 + 1) for _ in range(2)]
