@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from simpel_cli.blow_up import blown_up
 from simpel_cli.domain import Domain
 from simpel_cli.encoding import Encoding
-from simpel_cli.errors import ConfigError, SimpelError
+from simpel_cli.errors import ConfigError
 from simpel_cli.gap import marginal_likelihood_scale
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
-from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
+from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
 from simpel_cli.transition import Transition, encoding_of, transition
 from simulators.model import Model
 from simulators.parameters import draw
@@ -48,10 +49,19 @@ class System(NamedTuple):
     transition: Transition | None
 
     def simulate(self, key: PRNGKeyArray, x: np.ndarray, n: int) -> np.ndarray:
-        """Draw n simulators from p(phi) and run each at every input x (M, dx); returns (n, M, dy), float64."""
+        """Draw n simulators from p(phi) and run each at every input x (M, dx); returns (n, M, dy), float64.
+
+        Raises:
+            ConfigError: a simulator returned something that is not finite; names state, input and parameters.
+        """
         if self.transition is not None:
             prior = SimulatorPrior(gap=None).bind(self.transition, *self.dims, np.ones(self.encoding.dim_x))
-            return np.asarray(jax.jit(prior.simulate, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
+            values = np.asarray(jax.jit(prior.simulate, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
+            if not np.isfinite(values).all():
+                # the same key draws the same parameters again
+                phi = np.asarray(sample_parameters(key, self.transition.params, n, jnp.dtype(jnp.float64)))
+                raise blown_up(self.source, self.encoding, x, phi, values)
+            return values
         assert not isinstance(self.source, Model)
         return query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
 
@@ -74,7 +84,7 @@ def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) ->
     """Run n parameter draws of a world at every input (M, dx); returns targets (n, M, dy).
 
     Raises:
-        SimpelError: the world returned something that is not finite.
+        ConfigError: the world returned something that is not finite; names state, input and parameters.
     """
     states, stacked = encoding.split_x(x)
     inputs = stacked[:, stacked.shape[1] - len(world.inputs) :]
@@ -82,11 +92,7 @@ def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) ->
     m = len(x)
     after = world.step(np.tile(states, (n, 1)), np.tile(inputs, (n, 1)), np.repeat(phi, m, axis=0))
     if not np.isfinite(after).all():
-        worst = int(np.flatnonzero(~np.isfinite(after).all(axis=1))[0])
-        raise SimpelError(
-            f"sim: {world.name} returned {after[worst]} for state {states[worst % m]}, input {inputs[worst % m]}, "
-            f"parameters {phi[worst // m]}. Narrow its ranges, or make it return finite states."
-        )
+        raise blown_up(world, encoding, x, phi, after.reshape(n, m, -1))
     targets = encoding.to_y(np.tile(states, (n, 1)), after, np.zeros((n * m, 0)))
     return targets.reshape(n, m, -1)
 
@@ -111,7 +117,7 @@ def normaliser_of(system: System, key: PRNGKeyArray) -> Normaliser:
         if not (np.isfinite(value) and value > 1e-12 * max(1.0, size[name])):
             raise ConfigError(
                 f"sim: the change of `{name}` in one transition has standard deviation {value} over the declared ranges. "
-                "An output that never changes (or overflows) cannot be learned: check ranges and dynamics."
+                "An output that never changes cannot be learned: check ranges and dynamics."
             )
     for q in system.encoding.states:
         change = 0.0 if q.periodic else std[system.encoding.y_names.index(q.name)]
@@ -240,7 +246,10 @@ def _gap_scale(
         declared = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
     if not np.isnan(declared).any():
         return declared
-    subset = slice(0, SCALE_POINTS)
+    subset: slice | np.ndarray = slice(None)
+    if len(x) > SCALE_POINTS:  # the first ones may all be of one episode
+        key, key_rows = jax.random.split(key)
+        subset = np.asarray(jax.random.choice(key_rows, len(x), (SCALE_POINTS,), replace=False))
     samples = (system.simulate(key, x[subset], SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
     normalised = (x[subset] - normaliser.x_mean) / normaliser.x_std
     correlation = np.asarray(

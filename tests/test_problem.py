@@ -1,14 +1,16 @@
 """Normaliser, gap scale by each rule, and the bank of a world that only answers queries."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.errors import ConfigError, SimpelError
+from simpel_cli.errors import ConfigError
 from simpel_cli.inference import NoiseModel, padded_length
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
-from simpel_cli.problem import WORLD_POINTS, assemble, normaliser_of, system_of
+from simpel_cli.problem import SCALE_POINTS, WORLD_POINTS, assemble, normaliser_of, system_of
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Declared, ModelError
 from simulators.worlds.callable_world import CallableWorld
@@ -125,8 +127,73 @@ def test_one_query_at_a_time_gives_the_same():
 def test_wrong_answers_of_a_world_are_named():
     with pytest.raises(ModelError, match="Is `batched` right"):
         world(lambda s, u, a: s[0]).step(np.zeros((3, 1)), np.zeros((3, 1)), np.ones((3, 1)))
-    with pytest.raises(SimpelError, match="returned \\[nan\\]"):
-        normaliser_of(system_of(world(lambda s, u, a: s * np.nan), (), 0), KEY)
+
+
+def said(error: pytest.ExceptionInfo[ConfigError]) -> dict[str, float]:
+    """Numbers that a message names."""
+    return {name: float(value) for name, value in re.findall(r"(\w+) = (\S+?)[ ,;]", str(error.value))}
+
+
+def test_a_world_that_returns_nan_is_named_with_a_query_that_does_it():
+    def fails(states, inputs, params):
+        return np.where((states > 0.5) & (params < 0.7), np.nan, exact(states, inputs, params))
+
+    with pytest.raises(
+        ConfigError, match=r"sim: decay is not finite .*state x = .* m; input u = .* N; parameters a = .* 1/s"
+    ) as e:
+        normaliser_of(system_of(world(fails), (), 0), KEY)
+    point = said(e)
+    assert point["x"] > 0.5
+    assert point["a"] < 0.7
+    assert "make it return finite states" in str(e.value)
+
+
+def test_a_declared_simulator_that_blows_up_is_named_with_a_point_that_does_it():
+    source = Declared("root", DT, **VARIABLES, dynamics={"x": "u + sqrt(a - x)"}).model()
+    system = system_of(source, (), 0)
+    with pytest.raises(
+        ConfigError, match=r"sim: root is not finite .*state x = .* m; input u = .* N; parameters a = .* 1/s"
+    ) as e:
+        normaliser_of(system, KEY)
+    point = said(e)
+    assert set(point) == {"x", "u", "a"}
+    one = system.transition.step(jnp.array([point["x"], point["u"]]), jnp.array([point["a"]]))
+    assert not np.isfinite(one).all()
+    assert "sqrt(max(h, 0)), raise sim.substeps" in str(e.value)
+
+
+def test_training_inputs_at_which_the_simulator_blows_up_are_named_too():
+    source = Declared("root", DT, **VARIABLES, dynamics={"x": "u + sqrt(5 + a - x)"}).model()
+    system = system_of(source, (), 0)
+    normaliser = normaliser_of(system, KEY)
+    x = np.array([[0.0, 0.0], [9.0, 1.0], [0.5, -1.0]])
+    with pytest.raises(ConfigError, match=r"from state x = 9 m; input u = 1 N; parameters a = .*\(512 of 1536 runs\)"):
+        assemble(
+            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [(x, x[:, :1])], {}, {},
+            noise=NoiseModel(), pool=16, keys=[KEY], precision="float32",
+        )  # fmt: skip
+
+
+def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
+    """Rows in the order of the file: the first half agrees with the simulator, the second is off by a smooth gap."""
+    system = system_of(declared(), (), 0)
+    normaliser = normaliser_of(system, KEY)
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (400, 1)), rng.uniform(-2, 2, (400, 1))
+    gap = np.where(np.arange(400)[:, None] < 200, 0.0, 0.3 * states**2 + 0.3 * inputs)
+    x = system.encoding.to_x(states, inputs)
+    y = exact(states, inputs, np.ones((400, 1))) - states + gap
+
+    def chosen(rows, key):
+        return assemble(
+            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [(x[rows], y[rows])], {}, {},
+            noise=NoiseModel(), pool=16, keys=[key], precision="float32",
+        ).gap_scale[0]  # fmt: skip
+
+    quiet = chosen(slice(0, SCALE_POINTS), KEY)
+    assert chosen(slice(None), KEY) > 3 * quiet
+    assert chosen(slice(None), KEY) == chosen(slice(None), KEY)
+    assert chosen(slice(None), KEY) != chosen(slice(None), jax.random.key(1))
 
 
 def test_learned_noise_starts_at_and_stays_above_what_was_measured():

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from simpel_cli.config import Job
-from simpel_cli.data import Measurements, Recording, read, select, transitions
+from simpel_cli.data import Measurements, Recording, absolute, read, select, transitions
 from simpel_cli.errors import ConfigError, did_you_mean
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
@@ -112,11 +112,8 @@ def open_study(config: dict[str, Any], data_folder: Path) -> Study:
 def resolved(job: Job) -> dict[str, Any]:
     """Return the configuration as it is kept in the run directory: absolute path of the data, choices of groups."""
     config = dict(job.config)
-    path = (config.get("data") or {}).get("path")
-    if isinstance(path, str):
-        places = [job.data_folder / path, Path(path)]
-        found = next((p for p in places if p.is_file()), places[0])
-        config["data"] = config["data"] | {"path": str(found.resolve())}
+    if isinstance(config.get("data"), dict):
+        config["data"] = absolute(config["data"], job.data_folder)
     return config
 
 

@@ -1,11 +1,12 @@
 """Measurements: read, checked, cut into episodes, brought to the simulator's dt and split."""
 
 from simpel_cli.data.config import Measurements
+from simpel_cli.data.files import absolute
 from simpel_cli.data.reader import read
 from simpel_cli.data.recording import Check, Episode, Recording, Transitions, select, transitions
 from simpel_cli.data.segments import Places, origins, places
 
 __all__ = [
-    "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "origins", "places", "read", "select",
-    "transitions",
+    "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "absolute", "origins", "places", "read",
+    "select", "transitions",
 ]  # fmt: skip

@@ -5,17 +5,21 @@ import math
 import numpy as np
 
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.recording import Check
+from simpel_cli.data.recording import Check, Source
 from simpel_cli.data.rows import Rows
+from simpel_cli.data.sensor_checks import IRREGULAR_SHARE, irregular_share
+from simpel_cli.data.smoother import speeds
 from simpel_cli.data.table import Table
 from simpel_cli.data.units import period
 from simpel_cli.errors import ConfigError, DataError
-from simulators.model import Model, Quantity
+from simulators.model import Quantity
 
 DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
 MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
+MOSTLY = 0.5  # of the values outside a range: it is the unit, not the motion
+DEGREES = 361.0  # no angle in degrees within one turn reads more
+MANY_GAPS = 0.01  # of the steps; more are a clock that is irregular
 LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
-STALE_SHARE = 0.05  # of the rows; fewer repeats are what a quantised sensor gives
 
 
 def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Check, Rows]:
@@ -65,13 +69,13 @@ def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
         if config.episode is None:
             cure += " If the file holds several episodes, name their column: data.episode."
         raise DataError(
-            f"time {fault} at {table.place(int(rows.number[i + 1]))} of {table.path.name}, episode {rows.episode[i]}: "
+            f"time {fault} at {table.place(int(rows.number[i + 1]))}, episode {rows.episode[i]}: "
             f"{rows.time[i]:.6g} s, then {rows.time[i + 1]:.6g} s. {cure}"
         )
     return Check("time", True, "increasing")
 
 
-def sampling(rows: Rows, model: Model, config: Measurements) -> tuple[Check, float]:
+def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, float]:
     """Compare the distance of the rows with the simulator's dt.
 
     Returns:
@@ -99,27 +103,29 @@ def sampling(rows: Rows, model: Model, config: Measurements) -> tuple[Check, flo
             f"Record faster, or set sim.dt: {dt:.4g} and data.resample: null."
         )
     if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
+        bridge, why = "", ""
+        if irregular_share(steps, dt) > IRREGULAR_SHARE:
+            bridge = _bridge(steps, 1.5 * max(dt, model.dt), " and ")
+            why = " (in the middle; they are irregular)"
         raise DataError(
-            f"the rows are {dt:.4g} s apart, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
-            f"Bring the data to it with data.resample: {model.dt:g}, or set sim.dt: {dt:.4g}."
+            f"the rows are {dt:.4g} s apart{why}, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
+            f"Bring the data to it with data.resample: {model.dt:g}{bridge}, or set sim.dt: {dt:.4g}."
         )
-    jitter = float(np.mean(np.abs(steps / dt - 1) > DT_TOLERANCE))
-    detail = f"dt {dt:.4g} s" + (f", {jitter:.1%} of the steps differ by more than 2 %" if jitter else "")
-    return Check("sampling", jitter < STALE_SHARE or config.resample is not None, detail), dt
+    return Check("sampling", True, f"dt {dt:.4g} s"), dt
 
 
-def gaps(rows: Rows, dt: float, max_gap: float | int | None) -> tuple[Check, np.ndarray]:
+def gaps(rows: Rows, dt: float, config: Measurements) -> tuple[Check, np.ndarray]:
     """Find where a segment of contiguous rows starts.
 
     Args:
         rows: checked for NaN.
         dt: of the data, s.
-        max_gap: s; None = 1.5 dt.
+        config: `max_gap`, s; null = 1.5 steps, of the data or of what they are resampled to.
 
     Returns:
         The check, and a mask (n,): True at the first row of every segment (new episode, new split, dropped row, gap).
     """
-    limit = 1.5 * dt if max_gap is None else max_gap
+    limit = 1.5 * max(dt, config.resample or 0.0) if config.max_gap is None else config.max_gap
     steps = np.diff(rows.time)
     gap = _follows(rows) & (steps > limit)
     starts = np.concatenate([[True], ~_follows(rows) | gap | (rows.split[1:] != rows.split[:-1])])
@@ -128,10 +134,21 @@ def gaps(rows: Rows, dt: float, max_gap: float | int | None) -> tuple[Check, np.
     shown = [f"episode {rows.episode[i]} at {rows.time[i]:.4g} s ({steps[i]:.3g} s)" for i in np.flatnonzero(gap)[:3]]
     more = ", ..." if gap.sum() > len(shown) else ""
     detail = f"{int(gap.sum())} gaps longer than {limit:.3g} s, cut there: {', '.join(shown)}{more}"
+    if config.resample is not None and gap.sum() > MANY_GAPS * np.sum(_follows(rows)):
+        detail += f". Wider ones are bridged with {_bridge(steps[_follows(rows)], limit, '')}"
     return Check("gaps", False, detail), starts
 
 
-def constant(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
+def _bridge(steps: np.ndarray, limit: float, before: str) -> str:
+    """Say which data.max_gap passes over 99 % of the steps; nothing if they are no longer than the limit anyway."""
+    longest = float(np.percentile(steps, 99))
+    if longest <= limit:
+        return ""
+    digit = 10.0 ** (math.floor(math.log10(longest)) - 1)
+    return f"{before}data.max_gap: {math.ceil(longest / digit) * digit:.4g}"
+
+
+def constant(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
     """Warn of columns that never change.
 
     Raises:
@@ -145,30 +162,39 @@ def constant(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
     return Check("constant", not still, f"constant: {', '.join(still)}" if still else "every column changes")
 
 
-def stale(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
-    """Warn of rows that repeat all measured states and outputs of the row before."""
-    inputs = {q.name for q in model.inputs}
-    observed = [values for name, values in _named(rows, model, outputs).items() if name not in inputs]
-    repeats = np.diff(np.column_stack(observed), axis=0) == 0
-    share = float(np.mean(repeats.all(axis=1)[_follows(rows)])) if _follows(rows).any() else 0.0
-    if share <= STALE_SHARE:
-        return Check("stale", True, "rows are fresh")
-    return Check(
-        "stale", False, f"{share:.0%} of the rows repeat the one before: held samples, a coarse sensor or rest"
-    )
+def ranges(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
+    """Count values outside the simulator's declared ranges; angles are compared modulo a turn.
 
-
-def ranges(rows: Rows, model: Model, outputs: tuple[str, ...]) -> Check:
-    """Count values outside the simulator's declared ranges; angles are compared modulo a turn."""
+    Where most of an angle or a turn rate is outside, it may be in degrees. An angle in degrees is inside modulo a turn,
+    so it is also suspected if it is outside as it stands and would turn faster than its speed is declared to be.
+    """
     quantities = {q.name: q for q in (*model.states, *model.inputs, *model.outputs)}
     found = []
     for name, values in _named(rows, model, outputs).items():
         quantity = quantities[name]
         outside = int(np.sum(_outside(values, quantity)))
-        if outside:
-            box = f"[{quantity.low:g}, {quantity.high:g}] {quantity.unit}"
-            found.append(f"{name} {outside} of {len(values)} outside {box}")
+        box = f"[{quantity.low:g}, {quantity.high:g}] {quantity.unit}".rstrip()
+        in_degrees = f": is it in degrees? Then multiply the column by pi/180 ({math.pi / 180:.4f})"
+        if quantity.unit.startswith("rad") and quantity.periodic and _too_fast(rows, values, quantity, model):
+            found.append(f"{name} reaches {np.max(np.abs(values)):.4g}, most of it outside {box}{in_degrees}")
+        elif outside:
+            cure = ""
+            if outside > MOSTLY * len(values):
+                cure = in_degrees if quantity.unit.startswith("rad") else ": compare the unit of the column"
+            found.append(f"{name} {outside} of {len(values)} outside {box}{cure}")
     return Check("ranges", not found, "; ".join(found) if found else "all values inside the declared ranges")
+
+
+def _too_fast(rows: Rows, values: np.ndarray, angle: Quantity, model: Source) -> bool:
+    """Whether an angle lies mostly outside its range, and turns faster than its speed's range, or than can be seen."""
+    if np.mean((values < angle.low) | (values > angle.high)) <= MOSTLY or not _follows(rows).any():
+        return False
+    turned = np.abs(np.diff(values))[_follows(rows)]
+    ranges = {q.name: max(abs(q.low), abs(q.high)) for q in model.states}
+    limits = [ranges[speed] for speed, angles in speeds(model).items() if angle.name in angles]
+    if limits:
+        return bool(np.median(turned / np.diff(rows.time)[_follows(rows)]) > min(limits))
+    return bool(np.max(np.abs(values)) <= DEGREES and np.ptp(values) > 4 * math.pi)
 
 
 def _outside(values: np.ndarray, quantity: Quantity) -> np.ndarray:
@@ -181,7 +207,7 @@ def _outside(values: np.ndarray, quantity: Quantity) -> np.ndarray:
     return (values < quantity.low - slack) | (values > quantity.high + slack)
 
 
-def _named(rows: Rows, model: Model, outputs: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _named(rows: Rows, model: Source, outputs: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Measured columns by name: states, inputs, outputs."""
     states = {q.name: column for q, column in zip(model.states, rows.states.T, strict=True)}
     measured = {name: column for name, column in states.items() if not np.isnan(column).all()}

@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from simpel_cli.errors import ConfigError, DataError, did_you_mean
+from simpel_cli.errors import ConfigError, did_you_mean
 
 LAYOUTS = ("trajectories", "transitions")
 CHOICES = ("random", "first")
@@ -15,14 +14,17 @@ SPLIT_DEFAULT: dict[str, Any] = {"test_fraction": 0.25, "by": "episode"}
 
 @dataclass(frozen=True)
 class Measurements:
-    """A file of measurements and how it maps onto a simulator.
+    """Files of measurements and how they map onto a simulator.
 
     Args:
-        path: a .parquet or .csv file; relative paths are tried against the config file's folder, then the working one.
+        path: a .parquet or .csv file, or a list of them with the same columns; relative paths are tried against the
+            config file's folder, then the working one. An episode never runs on from one file into the next: where
+            their names are the same in two files, or none are given, they are called by the file's name.
         time: column of the time, s. Without it, a row is one `dt` of the simulator.
         episode: column that names the episode of a row. Without it, the file is one episode.
         columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
         split: `{column: name}` with the values train and test (other values are left out and counted), or
+            `{test_files: [test.csv]}`: these of the files in `path` to test on, the others to train on, or
             `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode. A single
             episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
@@ -36,13 +38,14 @@ class Measurements:
         units: quantity of the simulator -> unit of its column, compared with the simulator's. Also read from Parquet
             field metadata (`unit`) and from `card.yaml` beside the file (`columns: {phi: {unit: rad}}`).
         stack_actions: number of past inputs that a transition carries along.
-        max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt of the data.
+        max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt, of the data or, if that is longer,
+            of what they are resampled to.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
     """
 
-    path: str
+    path: str | tuple[str, ...]
     time: str | None = None
     episode: str | None = None
     columns: Mapping[str, str | None] = field(default_factory=dict)
@@ -59,6 +62,8 @@ class Measurements:
     max_gap: float | int | None = None
 
     def __post_init__(self) -> None:
+        if not self.paths or not all(isinstance(path, str) and path for path in self.paths):
+            raise ConfigError(f"data.path: {self.path!r} is not allowed, only the name of a file or a list of names.")
         _one_of("layout", self.layout, LAYOUTS)
         _one_of("choice", self.choice, CHOICES)
         _positive("resample", self.resample)
@@ -83,6 +88,11 @@ class Measurements:
             raise ConfigError(
                 "data.resample: the distance of the rows is not known. Name the column of the time: data.time: <name>."
             )
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The files, one or several."""
+        return (self.path,) if isinstance(self.path, str) else tuple(self.path)
 
     def seed_or(self, run_seed: int) -> int:
         """Return the seed of the split and of the choice: its own if declared, else the run's."""
@@ -111,22 +121,6 @@ class Measurements:
                     )
 
 
-def locate(path: str, base: Path) -> Path:
-    """Find the file: an absolute path, else against `base` (the config file's folder), else the working directory.
-
-    Raises:
-        DataError: nothing is there; the message lists the places that were tried.
-    """
-    given = Path(path).expanduser()
-    tried = [given] if given.is_absolute() else [base / given, Path.cwd() / given]
-    for candidate in tried:
-        if candidate.is_file():
-            return candidate.resolve()
-    folder = " It is a folder, not a file." if any(c.is_dir() for c in tried) else ""
-    places = ", ".join(dict.fromkeys(str(c) for c in tried))
-    raise DataError(f"data.path: '{path}' was not found.{folder} Tried: {places}.")
-
-
 def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         hint = did_you_mean(str(value), list(allowed))
@@ -148,13 +142,18 @@ def _whole(key: str, value: Any, least: int) -> None:
 
 
 def _check_split(split: Mapping[str, Any]) -> None:
-    forms = "{column: <name>} or {test_fraction: 0.25, by: episode|time}"
-    allowed = ("column", "test_fraction", "by")
+    forms = "{column: <name>}, {test_files: [<file>]} or {test_fraction: 0.25, by: episode|time}"
+    allowed = ("column", "test_files", "test_fraction", "by")
     for key in split:
         if key not in allowed:
             raise ConfigError(f"data.split.{key}: no such key, only {forms}.{did_you_mean(key, list(allowed))}")
-    if not split or ("column" in split and len(split) > 1):
+    if not split or (len(split) > 1 and ("column" in split or "test_files" in split)):
         raise ConfigError(f"data.split: {dict(split)} is not allowed, only {forms}.")
+    if "test_files" in split:
+        files = split["test_files"]
+        if not (isinstance(files, list | tuple) and files and all(isinstance(file, str) and file for file in files)):
+            raise ConfigError(f"data.split.test_files: {files!r} is not a list of files, e.g. [test.csv].")
+        return
     if "column" in split:
         if not isinstance(split["column"], str):
             raise ConfigError(f"data.split.column: {split['column']!r} is not the name of a column.")

@@ -5,21 +5,23 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.data import checks
-from simpel_cli.data.config import Measurements, locate
+from simpel_cli.data import checks, sensor_checks
+from simpel_cli.data.config import Measurements
+from simpel_cli.data.files import by_file, locate
+from simpel_cli.data.kinematics import Motion, derived, kinematics
 from simpel_cli.data.noise import third_difference_std
-from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
-from simpel_cli.data.smoother import estimate_speeds
+from simpel_cli.data.smoother import estimate_speeds, speeds
 from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.table import read_table
-from simpel_cli.data.units import check_units, period, read_card
+from simpel_cli.data.units import check_units, period
 from simpel_cli.errors import DataError
-from simulators.model import Model, Quantity
+from simulators.model import Quantity
 
 
-def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording:
+def read(config: Measurements, model: Source, base: Path, seed: int) -> Recording:
     """Read measurements for a simulator.
 
     Args:
@@ -38,19 +40,19 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
     measurable = (*model.states, *model.outputs)
     quantities = (*measurable, *model.inputs)
     config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
-    path = locate(config.path, base)
-    table = read_table(path)
-    card_units, card = read_card(path)
+    paths = tuple(locate(path, base) for path in config.paths)
+    table = read_table(paths)
     mapping = map_columns(config, model, table)
     dynamic = bool(model.states) and config.layout == "trajectories"
 
-    report = [check_units(config, table, card_units, mapping.columns, quantities)]
+    units, cards = check_units(config, table, mapping.columns, quantities)
+    report = [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
     finite, rows = checks.finite(rows, measured, _column_names(config, model, mapping))
-    split, rows = assign(config, table, rows, dynamic, config.seed_or(seed))
+    split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
-    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.stale, checks.ranges)]
+    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.ranges)]
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
@@ -68,18 +70,18 @@ def read(config: Measurements, model: Model, base: Path, seed: int) -> Recording
         noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
         estimated=mapping.unmeasured,
         checks=tuple(report),
-        files=(path, card) if card is not None else (path,),
+        files=(*paths, *cards),
     )
 
 
 def _trajectories(
-    config: Measurements, model: Model, rows: Rows, mapping: Mapping
+    config: Measurements, model: Source, rows: Rows, mapping: Mapping
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
     """Episodes by split, noise by quantity, checks."""
     sampling, raw = checks.sampling(rows, model, config)
-    gaps, starts = checks.gaps(rows, raw, config.max_gap)
-    report = [sampling, gaps]
+    gaps, starts = checks.gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
+    report = [sampling, gaps, *_sensors(config, model, mapping, [episode for _, episode in tagged], raw)]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
@@ -100,7 +102,32 @@ def _trajectories(
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
 
 
-def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
+def _sensors(config: Measurements, model: Source, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
+    """Faults of the sensors and the clock, of the rows as they were measured."""
+    observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
+    columns = {
+        q.name: [np.concatenate([s.states, s.outputs], axis=1)[:, i] for s in segments]
+        for i, q in enumerate(observed)
+        if q.name in mapping.columns
+    }
+    units = {q.name: q.unit for q in observed}
+    times = [segment.time for segment in segments]
+    motions = [
+        Motion(p, v, units[v], list(zip(times, columns[p], columns[v], strict=True)))
+        for v, positions in speeds(model).items()
+        for p in positions
+        if p in columns and v in columns
+    ]
+    return [
+        sensor_checks.jitter(times, dt, model.dt if config.resample is None else None),
+        sensor_checks.stale(columns),
+        sensor_checks.quantisation(columns, units),
+        kinematics(motions),
+        derived(motions),
+    ]
+
+
+def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
     """Contiguous rows with their split; a second segment of episode 3 is called 3/2. Angles are unwrapped."""
     first = np.flatnonzero(starts)
     seen: Counter[str] = Counter()
@@ -119,7 +146,7 @@ def _segments(model: Model, rows: Rows, starts: np.ndarray) -> list[tuple[str, E
     return segments
 
 
-def _pairs(config: Measurements, model: Model, rows: Rows, part: str) -> tuple[Episode, ...]:
+def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[Episode, ...]:
     """Rows that are transitions on their own, one `Episode` per named episode, or one for all."""
     chosen = rows.take(rows.split == part)
     following = chosen.next_states.copy()
@@ -145,7 +172,7 @@ def _unwrap(values: np.ndarray, quantities: tuple[Quantity, ...]) -> np.ndarray:
     return turned
 
 
-def _long_enough(config: Measurements, model: Model, episodes: tuple[Episode, ...]) -> tuple[list[Episode], Check]:
+def _long_enough(config: Measurements, model: Source, episodes: tuple[Episode, ...]) -> tuple[list[Episode], Check]:
     """Keep segments with at least one transition."""
     least = config.stack_actions + (2 if model.states else 1)
     kept = [episode for episode in episodes if len(episode.time) >= least]
@@ -156,7 +183,7 @@ def _long_enough(config: Measurements, model: Model, episodes: tuple[Episode, ..
     return kept, Check("length", short == 0, detail)
 
 
-def _noise(config: Measurements, model: Model, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
+def _noise(config: Measurements, model: Source, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
     """Standard deviation of the noise per measured state and output, declared or estimated, before any filter."""
     names = [q.name for q in model.states] + list(mapping.outputs)
     std = {}
@@ -172,7 +199,7 @@ def _noise(config: Measurements, model: Model, mapping: Mapping, train: list[Epi
     return std
 
 
-def _noise_check(config: Measurements, model: Model, noise: dict[str, float]) -> Check:
+def _noise_check(config: Measurements, model: Source, noise: dict[str, float]) -> Check:
     units = {q.name: q.unit for q in (*model.states, *model.outputs)}
     shown = [
         f"{name} {config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
@@ -182,7 +209,7 @@ def _noise_check(config: Measurements, model: Model, noise: dict[str, float]) ->
     return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
 
 
-def _column_names(config: Measurements, model: Model, mapping: Mapping) -> tuple[str, ...]:
+def _column_names(config: Measurements, model: Source, mapping: Mapping) -> tuple[str, ...]:
     """Columns behind `checks.finite`, in its order."""
     states = [mapping.columns[q.name] for q in model.states if q.name in mapping.columns]
     inputs = [mapping.columns[q.name] for q in model.inputs]

@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from zlib import crc32
 
 import numpy as np
 
 from simpel_cli.errors import DataError
+from simulators.model import Model
+from simulators.worlds.world import World
+
+Source: TypeAlias = Model | World  # what measurements are read for
 
 
 class Check(NamedTuple):

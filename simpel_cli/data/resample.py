@@ -75,7 +75,7 @@ def lowpass(ratio: float) -> np.ndarray:
 def _one(episode: Episode, raw: float, dt: float, taps: np.ndarray) -> Episode:
     n_states = episode.states.shape[1]
     time, values = _equidistant(episode.time, np.concatenate([episode.states, episode.outputs], axis=1), raw)
-    if len(time) < max(len(taps), 2):
+    if len(time) <= len(taps):  # less than two rows would be left
         return Episode(episode.name, *(column[:0] for column in episode[1:5]))
     half = len(taps) // 2
     if half:

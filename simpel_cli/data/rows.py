@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.data.config import Measurements
+from simpel_cli.data.recording import Source
 from simpel_cli.data.table import Table
 from simpel_cli.errors import DataError
-from simulators.model import Model
 
 
 class Rows(NamedTuple):
@@ -36,7 +36,7 @@ class Mapping(NamedTuple):
     unmeasured: tuple[str, ...]  # states
 
 
-def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
+def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
     """Find the column of every quantity.
 
     An output without a column is left out; a state can be declared as not measured; inputs must be there.
@@ -69,13 +69,13 @@ def map_columns(config: Measurements, model: Model, table: Table) -> Mapping:
     unmeasured = tuple(name for name in states if name not in columns)
     if not measured_outputs and len(unmeasured) == len(states):
         raise DataError(
-            f"nothing of {table.path.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
+            f"nothing of {table.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
             f"Say `columns: {{{[*states, *outputs, 'name'][0]}: <name>}}`."
         )
     return Mapping(columns, measured_outputs, unmeasured)
 
 
-def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) -> Rows:
+def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping) -> Rows:
     """Bring the columns of a file into the simulator's order, rows sorted by episode (in order of appearance).
 
     `split` stays empty here.
@@ -84,13 +84,7 @@ def arrange(config: Measurements, model: Model, table: Table, mapping: Mapping) 
         DataError: a column is missing or holds text where numbers should be.
     """
     n = len(table)
-    if config.episode is not None:
-        episode = _labels(table, config.episode, "data.episode")
-    elif config.layout == "transitions" and config.split.get("by") != "time":
-        # rows do not follow each other, so that each can go to train or test on its own
-        episode = np.arange(n).astype(str)
-    else:
-        episode = np.full(n, "0")
+    episode = _episodes(config, table)
     order, position = _by_episode(episode)
     names = [q.name for q in model.states]
     following = [_following(table, mapping, name) for name in names] if config.layout == "transitions" else []
@@ -112,13 +106,29 @@ def split_labels(config: Measurements, table: Table, column: str) -> np.ndarray:
     return _labels(table, column, "data.split.column")
 
 
+def _episodes(config: Measurements, table: Table) -> np.ndarray:
+    """Name of every row's episode, (n,) text; no episode runs on from one file into another."""
+    n, file = len(table), table.file
+    if config.episode is None:
+        if config.layout == "transitions" and config.split.get("by") != "time":
+            # rows do not follow each other, so that each can go to train or test on its own
+            return np.arange(n).astype(str)
+        return np.array(table.stems)[file] if len(table.sheets) > 1 else np.full(n, "0")
+    label = _labels(table, config.episode, "data.episode")
+    pairs = {(name, i) for name, i in zip(label.tolist(), file.tolist(), strict=True) if name}
+    if len(pairs) == len({name for name, _ in pairs}):
+        return label
+    prefixed = np.char.add(np.char.add(np.array(table.stems)[file], ":"), label)
+    return np.where(label == "", "", prefixed)
+
+
 def _labels(table: Table, column: str, key: str) -> np.ndarray:
     if column not in table.columns:
         raise table.missing(column, f"Name the right column in {key}.")
     return table.labels(column)
 
 
-def _time(config: Measurements, model: Model, table: Table, position: np.ndarray) -> np.ndarray:
+def _time(config: Measurements, model: Source, table: Table, position: np.ndarray) -> np.ndarray:
     if config.time is None:
         return position * model.dt
     if config.time not in table.columns:

@@ -12,13 +12,14 @@ and so differentiates noise where data are oversampled. tr H follows from the sp
 References: Craven and Wahba (1979); Reinsch (1967) for the matrices behind `_penalty`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import casadi
 import numpy as np
 
-from simpel_cli.data.recording import Check, Episode
+from simpel_cli.data.hidden import Drive, drive, solve
+from simpel_cli.data.recording import Check, Episode, Source
 from simpel_cli.errors import DataError
 from simulators.model import Model
 
@@ -38,12 +39,15 @@ class Smoothed(NamedTuple):
     check: Check
 
 
-def speeds(model: Model) -> dict[str, list[str]]:
-    """States v with d(p)/dt = v exactly, whatever the inputs and parameters: v -> its positions p."""
-    function = model.function()
+def speeds(model: Source) -> dict[str, list[str]]:
+    """States v with d(p)/dt = v exactly, whatever the inputs and parameters: v -> its positions p.
+
+    Nothing is known of a world, which shows no equations.
+    """
     n_states = len(model.states)
-    if n_states == 0:
+    if n_states == 0 or not isinstance(model, Model):
         return {}
+    function = model.function()
     rng = np.random.default_rng(0)
     points = [
         np.array([rng.uniform(q.low, q.high) for q in group]) for group in (model.states, model.inputs, model.params)
@@ -63,8 +67,8 @@ def speeds(model: Model) -> dict[str, list[str]]:
     return found
 
 
-def estimate_speeds(model: Model, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float) -> Smoothed:
-    """Fill in the states that were not measured.
+def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float) -> Smoothed:
+    """Fill in the states that were not measured: speeds first, then what drives a measured state (`hidden`).
 
     Args:
         model: tells which state is the speed of which.
@@ -76,10 +80,16 @@ def estimate_speeds(model: Model, episodes: Sequence[Episode], unmeasured: tuple
         Episodes of at least `MIN_ROWS` rows, and what was done.
 
     Raises:
-        DataError: a state is not the speed of a measured one.
+        DataError: a state is neither the speed of a measured one nor alone in driving one.
     """
     names = [q.name for q in model.states]
-    source = {name: _position(model, name, unmeasured) for name in unmeasured}
+    relations = speeds(model)
+    source = {
+        name: measured[0]
+        for name in unmeasured
+        if (measured := [p for p in relations.get(name, []) if p not in unmeasured])
+    }
+    drives = {name: _driven(model, name, unmeasured, relations, source) for name in unmeasured if name not in source}
     long = [episode for episode in episodes if len(episode.time) >= MIN_ROWS]
     if not long:
         raise DataError(f"too few rows: {', '.join(unmeasured)} cannot be estimated, no segment has {MIN_ROWS} rows.")
@@ -92,10 +102,26 @@ def estimate_speeds(model: Model, episodes: Sequence[Episode], unmeasured: tuple
             episode.states[:, v] = _slope(episode.time, episode.states[:, p], lam, raw)
         noise[name] = (position, slope_noise(lam) / raw)
         done.append(f"{name} = d({position})/dt of a smoothing spline (window about {lam**0.25 * raw:.2g} s, by GCV)")
+    leans = False
+    for name, found in drives.items():
+        assert isinstance(model, Model)  # of a world nothing is known that could be solved
+        lam = choose_smoothing([episode.states[:, found.seen] for episode in long])
+        solved = []
+        for episode in long:
+            rate = _slope(episode.time, episode.states[:, found.seen], lam, raw)
+            solved.append(solve(model, found, episode.states, episode.inputs, rate))
+            episode.states[:, found.hidden] = solved[-1].values
+        noise[name] = (names[found.seen], slope_noise(lam) / raw / float(np.median([s.sensitivity for s in solved])))
+        at_an_end = float(np.average([s.at_an_end for s in solved], weights=[len(e.time) for e in long]))
+        done.append(
+            f"{name} from d({names[found.seen]})/dt, by the simulator with its parameters in the middle of their ranges"
+            + (f" ({at_an_end:.1%} of the rows at an end of its range)" if at_an_end else "")
+        )
+        leans = True
     short = len(episodes) - len(long)
     if short:
         done.append(f"{short} segments shorter than {MIN_ROWS} rows dropped")
-    return Smoothed(tuple(long), noise, Check("estimated", short == 0, "; ".join(done)))
+    return Smoothed(tuple(long), noise, Check("estimated", short == 0 and not leans, "; ".join(done)))
 
 
 def choose_smoothing(signals: Sequence[np.ndarray]) -> float:
@@ -148,17 +174,18 @@ def _slope(time: np.ndarray, position: np.ndarray, lam: float, raw: float) -> np
     return np.asarray(make_smoothing_spline(x, position, lam=lam).derivative()(x)) / raw
 
 
-def _position(model: Model, name: str, unmeasured: tuple[str, ...]) -> str:
-    """The measured state whose speed is `name`."""
-    relations = speeds(model)
-    measured = [p for p in relations.get(name, []) if p not in unmeasured]
-    if measured:
-        return measured[0]
+def _driven(
+    model: Source, name: str, unmeasured: tuple[str, ...], relations: dict[str, list[str]], source: Mapping[str, str]
+) -> Drive:
+    """How a state that is no speed shows in a measured one; speeds count as measured by now."""
+    found = drive(model, name, [other for other in unmeasured if other not in source])
+    if found is not None:
+        return found
     able = [f"{v} from {p}" for v, positions in relations.items() for p in positions if p not in unmeasured]
     can = f"Of '{model.name}' can be estimated: {', '.join(able)}." if able else "None of its states can be estimated."
     raise DataError(
-        f"data.columns.{name}: null, but no measured state has '{name}' as its time derivative, so it cannot be "
-        f"estimated here. {can} Measure it, or use a simulator without it."
+        f"data.columns.{name}: null, but no measured state has '{name}' as its time derivative or a rate that tells "
+        f"it, so it cannot be estimated here. {can} Measure it, or use a simulator without it."
     )
 
 

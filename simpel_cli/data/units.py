@@ -41,35 +41,41 @@ def read_card(path: Path) -> tuple[dict[str, str], Path | None]:
 
 
 def check_units(
-    config: Measurements, table: Table, card: dict[str, str], measured: dict[str, str], quantities: tuple[Quantity, ...]
-) -> Check:
+    config: Measurements, table: Table, measured: dict[str, str], quantities: tuple[Quantity, ...]
+) -> tuple[Check, tuple[Path, ...]]:
     """Compare every declared unit with the simulator's; the data YAML wins over the file, the file over the card.
 
     Args:
         config: declares units per quantity.
-        table: declares units per column.
-        card: units per column.
+        table: declares units per column, as may a card beside each of its files.
         measured: quantity -> column.
         quantities: all quantities of the simulator.
+
+    Returns:
+        The check, and the cards that were read.
 
     Raises:
         DataError: units differ; the message names both and, for angles, the factor.
     """
-    of_column = card | table.units
-    if config.time is not None and _canonical(of_column.get(config.time) or "s") != "s":
-        raise DataError(
-            f"column '{config.time}' of {table.path.name} is in {of_column[config.time]}, time is read in s."
-        )
-    compared = 0
-    for quantity in quantities:
-        column = measured.get(quantity.name)
-        unit = config.units.get(quantity.name, of_column.get(column) if column is not None else None)
-        if column is None or not unit or not quantity.unit:  # one of them is not stated
-            continue
-        compared += 1
-        if _canonical(unit) != _canonical(quantity.unit):
-            raise DataError(_mismatch(table, column, unit, quantity))
-    return Check("units", True, f"{compared} of {len(measured)} columns declare a unit, all as the simulator's")
+    compared: set[str] = set()
+    cards: dict[Path, None] = {}
+    for sheet in table.sheets:
+        of_card, card = read_card(sheet.path)
+        cards |= {card: None} if card is not None else {}
+        of_column = of_card | sheet.units
+        if config.time is not None and _canonical(of_column.get(config.time) or "s") != "s":
+            raise DataError(
+                f"column '{config.time}' of {sheet.path.name} is in {of_column[config.time]}, time is read in s."
+            )
+        for quantity in quantities:
+            column = measured.get(quantity.name)
+            unit = config.units.get(quantity.name, of_column.get(column) if column is not None else None)
+            if column is None or not unit or not quantity.unit:  # one of them is not stated
+                continue
+            compared.add(quantity.name)
+            if _canonical(unit) != _canonical(quantity.unit):
+                raise DataError(_mismatch(sheet.path, column, unit, quantity))
+    return Check("units", True, _declared(len(compared), len(measured))), tuple(cards)
 
 
 def period(quantity: Quantity) -> float | None:
@@ -79,9 +85,16 @@ def period(quantity: Quantity) -> float | None:
     return 360.0 if _canonical(quantity.unit) == "deg" else 2 * math.pi
 
 
-def _mismatch(table: Table, column: str, unit: str, quantity: Quantity) -> str:
+def _declared(compared: int, measured: int) -> str:
+    if compared == 0:
+        return "no column declares a unit: all are read in the simulator's"
+    rest = "" if compared == measured else "; the others are read in its units"
+    return f"{compared} of {measured} columns declare a unit, the same as the simulator's{rest}"
+
+
+def _mismatch(path: Path, column: str, unit: str, quantity: Quantity) -> str:
     message = (
-        f"unit of column '{column}' in {table.path.name} is {unit}, but the simulator has '{quantity.name}' "
+        f"unit of column '{column}' in {path.name} is {unit}, but the simulator has '{quantity.name}' "
         f"in {quantity.unit}."
     )
     given, wanted = _canonical(unit), _canonical(quantity.unit)

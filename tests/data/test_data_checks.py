@@ -1,5 +1,6 @@
 """Each check of the rows: what it drops, cuts or counts, and the message where it refuses."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,9 @@ def test_stale_rows_are_counted(tmp_path: Path) -> None:
     columns = table()
     for name in ("a", "w"):
         columns[name][1::2] = columns[name][0::2]
-    assert "51% of the rows repeat" in check(read_columns(tmp_path, columns), "stale").detail
+    detail = check(read_columns(tmp_path, columns), "stale").detail
+    assert "a repeats its last value in" in detail
+    assert "w repeats its last value in" in detail
 
 
 def test_values_outside_the_range_are_counted_and_angles_compared_modulo_a_turn(tmp_path: Path) -> None:
@@ -213,3 +216,85 @@ def test_noise_after_resampling_is_that_of_the_new_rows(tmp_path: Path) -> None:
     left = np.std(episode.states[:, 0] - np.sin(episode.time))
     assert left < 0.01
     assert recording.noise_std["a"] == pytest.approx(left, rel=0.15)
+
+
+def irregular(wait: float) -> dict[str, np.ndarray]:
+    """Rows at random times, `wait` apart on average, of a motion that is slow beside it."""
+    columns = table(rows=300, episodes=4)
+    rng = np.random.default_rng(0)
+    columns["t"] = np.cumsum(0.02 + rng.exponential(wait - 0.02, (4, 300)), axis=1).ravel()
+    columns["a"], columns["w"] = np.sin(0.5 * columns["t"]), 0.5 * np.cos(0.5 * columns["t"])
+    return columns
+
+
+@pytest.mark.parametrize("wait", [0.07, 0.14, 0.3])
+def test_following_the_advice_for_an_irregular_clock_works(tmp_path: Path, wait: float) -> None:
+    columns = irregular(wait)
+    with pytest.raises(DataError, match=r"irregular") as error:
+        read_columns(tmp_path, columns)
+    advice = dict(re.findall(r"data\.(resample|max_gap): ([\d.]+)", str(error.value)))
+    assert set(advice) == {"resample", "max_gap"}
+    recording = read_columns(tmp_path, columns, **{key: float(value) for key, value in advice.items()})
+    episodes = (*recording.train, *recording.test)
+    assert sum(np.ptp(e.time) for e in episodes) > 0.8 * 4 * 300 * wait
+    for episode in episodes:
+        np.testing.assert_allclose(episode.states[:, 0], np.sin(0.5 * episode.time), atol=0.02)
+    # half of the advice says what the other half is
+    detail = check(read_columns(tmp_path, columns, resample=0.1), "gaps").detail
+    assert "cut there" in detail
+    assert f"bridged with data.max_gap: {advice['max_gap']}" in detail
+
+
+def test_jitter_about_the_right_step_is_cured_by_resampling(tmp_path: Path) -> None:
+    columns = table(rows=200)
+    columns["t"] += np.random.default_rng(0).uniform(-0.02, 0.02, 400)
+    found = check(read_columns(tmp_path, columns), "jitter")
+    assert not found.ok
+    assert "data.resample: 0.1 makes them equal" in found.detail
+    cured = read_columns(tmp_path, columns, resample=0.1)
+    assert check(cured, "jitter").ok
+    np.testing.assert_allclose(np.diff(cured.train[0].time), 0.1)
+
+
+def test_gaps_within_a_new_step_are_no_gaps(tmp_path: Path) -> None:
+    columns = table(rows=400)
+    columns["t"] /= 10
+    keep = np.arange(800) % 50 != 7  # one sample of 0.01 s is missing now and then: nothing beside 0.1 s
+    thinned = {name: values[keep] for name, values in columns.items()}
+    recording = read_columns(tmp_path, thinned, resample=0.1)
+    assert check(recording, "gaps").ok
+    assert len(recording.train) + len(recording.test) == 2
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_an_angle_in_degrees_is_suspected(tmp_path: Path, wrapped: bool) -> None:
+    columns = table(rows=200)
+    angle = np.degrees(2.5 * np.sin(columns["t"]))
+    columns["a"] = angle % 360 if wrapped else angle
+    columns["w"] = 2.5 * np.cos(columns["t"])
+    recording = read_columns(tmp_path, columns)
+    assert "a reaches" in check(recording, "ranges").detail
+    assert "is it in degrees? Then multiply the column by pi/180 (0.0175)" in check(recording, "ranges").detail
+    columns["a"] = np.radians(columns["a"])
+    assert check(read_columns(tmp_path, columns), "ranges").ok
+
+
+def test_a_turn_rate_in_degrees_is_suspected_and_many_turns_are_not(tmp_path: Path) -> None:
+    columns = table(rows=200)
+    columns["w"] = np.degrees(columns["w"])
+    assert (
+        "w 380 of 400 outside [-5, 5] rad/s: is it in degrees?"
+        in check(read_columns(tmp_path, columns), "ranges").detail
+    )
+    columns["a"], columns["w"] = 4 * columns["t"], np.full(400, 4.0) + 0.1 * np.sin(columns["t"])  # 12 turns in 20 s
+    assert check(read_columns(tmp_path, columns), "ranges").ok
+    columns["u"][:] = 5 + np.sin(columns["t"])
+    assert "outside [-1, 1] N m: compare the unit" in check(read_columns(tmp_path, columns), "ranges").detail
+
+
+def test_units_that_nobody_declares(tmp_path: Path) -> None:
+    assert check(read_columns(tmp_path, table()), "units").detail == (
+        "no column declares a unit: all are read in the simulator's"
+    )
+    some = check(read_columns(tmp_path, table(), {"a": "rad"}), "units").detail
+    assert some == "1 of 3 columns declare a unit, the same as the simulator's; the others are read in its units"

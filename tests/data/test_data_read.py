@@ -26,7 +26,25 @@ CART = Declared(
     outputs={"force": {"unit": "N", "expression": "k*v"}},
 ).model()
 
-NASTY = [b",", b"\n", b"\r", b'"', b";", b"\x00", b"e", b"-", b"9" * 400, b"nan", b"inf", b"1e308", b"\n\n"]
+NASTY = [
+    b"#",
+    b"\t",
+    b" ",
+    b"\n#",
+    b",",
+    b"\n",
+    b"\r",
+    b'"',
+    b";",
+    b"\x00",
+    b"e",
+    b"-",
+    b"9" * 400,
+    b"nan",
+    b"inf",
+    b"1e308",
+    b"\n\n",
+]
 
 
 def csv_text(episodes: int = 4, rows: int = 12) -> str:
@@ -54,6 +72,32 @@ def test_csv_values_and_episodes(tmp_path: Path) -> None:
         expected = np.stack([np.sin(t + int(episode.name)), np.cos(t + int(episode.name))], axis=1)
         np.testing.assert_allclose(episode.states, expected, atol=1e-8)
         np.testing.assert_array_equal(episode.inputs[:, 0], (np.arange(12) % 3) - 1)
+
+
+DIALECTS = {
+    "semicolons": lambda text: text.replace(",", ";"),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "blanks": lambda text: text.replace(", ", " ").replace(",", "   "),
+    "indented": lambda text: "".join(f"  {line}\n" for line in text.replace(", ", " ").replace(",", " ").splitlines()),
+    "windows": lambda text: text.replace("\n", "\r\n"),
+    "byte order mark": lambda text: "\ufeff" + text,
+    "remarks": lambda text: "# cart, first try\n#\n" + text.replace("\n1,0.500", "\n  # here it hit the wall; again\n1,0.500"),
+    "names in a remark": lambda text: "# cart\n# " + text,
+    "numpy": lambda text: "# " + text.replace(", ", " ").replace(",", " "),
+    "names by commas, rows by blanks": lambda text: "# " + text[:18] + text[18:].replace(",", " "),
+    "semicolons and remarks": lambda text: "# a;b\n" + text.replace(",", ";"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_other_ways_to_write_a_csv_file(tmp_path: Path, dialect: str) -> None:
+    (tmp_path / "run.csv").write_bytes(DIALECTS[dialect](csv_text()).encode())
+    config = Measurements("run.csv", time="t", episode="run", columns={"u": "volts"})
+    found, plain = read(config, CART, tmp_path, 0), read_text(tmp_path, csv_text(), name="plain.csv")
+    for a, b in zip((*found.train, *found.test), (*plain.train, *plain.test), strict=True):
+        np.testing.assert_array_equal(a.states, b.states)
+        np.testing.assert_array_equal(a.inputs, b.inputs)
+        assert a.name == b.name
 
 
 def test_parquet_reads_the_same_and_measures_an_output(tmp_path: Path) -> None:
@@ -119,7 +163,23 @@ def test_static_model_takes_every_row(tmp_path: Path) -> None:
     [
         ("", ["run.csv is empty"]),
         ("run,t,s,v,volts\n", ["has a header (run, t, s, v, volts) but no rows"]),
-        ("run;t;s;v;volts\n0;0,1;1,2;3,4;5,6\n", ["';'", "pandas.read_csv"]),
+        (
+            "run;t;s;v;volts\n0;0,1;1,2;3,4;5,6\n",
+            ["decimal comma: write 0.1", "read_csv('run.csv', sep=';', decimal=',')"],
+        ),
+        ("run t s v volts\n0 0,1 1,2 3,4 5,6\n", ["line 2 has '0,1'", "write 0.1", "sep='\\\\s+', decimal=','"]),
+        ("run,t,s;v,volts\n0,0,1;1,0\n", ["read in two ways", "a comma (4 columns) or a semicolon (2 columns)"]),
+        (
+            "run t [s] s v volts\n0 0.1 1 1 0\n",
+            ["its 5 columns by blanks", "header has 6 words", "names without blanks"],
+        ),
+        ("# made by hand\n# nothing else\n", ["run.csv has comment lines (#) only"]),
+        ("# no names\n0,0,1,1,0\n", ["run.csv starts with numbers"]),
+        ("run,t,s,v,volts\n# a remark\n0,0,1,1,0\n\n0,0.1,oops,1,0\n", ["column 's'", "line 5", "'oops'"]),
+        (
+            "# remark\nrun,t,s,v,volts\n0,0,1,1\n",
+            ["5 columns, but record 2", "comments are not counted", "has 4: '0,0,1,1'"],
+        ),
         ("run,t,s,v,volts\n0,0,0,1,0,5,6\n", ["record 2", "decimal comma"]),
         ('run,t,s,v,volts\n0,0,"0,5",1,0\n', ["column 's'", "decimal comma", "0.5"]),
         ("run,t,s,s,volts\n0,0,1,1,0\n", ["more than one column named s"]),
@@ -202,9 +262,7 @@ def test_mutated_csv_gives_a_recording_or_our_error(tmp_path_factory: pytest.Tem
             st.tuples(
                 st.integers(0, len(original) - 1),
                 st.integers(0, 3),
-                st.one_of(
-                    st.sampled_from([b",", b"\n", b"\r", b'"', b";", b"\x00", b"e", b"-", b"9" * 400]), st.binary()
-                ),
+                st.one_of(st.sampled_from(NASTY), st.binary()),
             ),
             min_size=1,
             max_size=6,

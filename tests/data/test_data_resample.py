@@ -69,3 +69,12 @@ def test_noise_gain_is_what_white_noise_keeps() -> None:
     (brought,), gain, _ = resample((episode,), 0.01, 0.1)
     assert np.std(brought.states) == pytest.approx(gain, rel=0.02)
     assert lowpass(10.0).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.095])
+@pytest.mark.parametrize("more", [-1, 0, 1])
+def test_segments_about_as_long_as_the_filter(more: int, dt: float) -> None:
+    rows = len(lowpass(dt / 0.01)) + more
+    brought, _, check = resample((tone(0.5, 0.01, seconds=0.01 * rows),), 0.01, dt)
+    assert brought == ()
+    assert "1 of 1 segments are too short" in check.detail

@@ -11,6 +11,7 @@ from simpel_cli.data.recording import Episode
 from simpel_cli.data.smoother import choose_smoothing, estimate_speeds, slope_noise, speeds
 from simpel_cli.errors import DataError
 from simulators.model import Declared, Model
+from simulators.worlds.callable_world import CallableWorld
 
 
 def declared(states: str, dynamics: dict[str, str]) -> Model:
@@ -65,6 +66,25 @@ def test_beats_finite_differences_at_every_rate(dt: float, gain: float) -> None:
     assert position == "phi"
     assert 0.3 * ours < 1e-3 * factor < 2 * ours  # the rest is the bias that smoothing trades for it
     assert "omega = d(phi)/dt of a smoothing spline" in smoothed.check.detail
+
+
+def test_a_world_shows_no_equations(tmp_path: Path) -> None:
+    """MuJoCo and functions of the user's answer queries only: nothing is estimated, and nothing compared."""
+    world = CallableWorld(
+        "w",
+        0.02,
+        lambda s, u, p: s,
+        True,
+        states={n: {"range": [-9, 9]} for n in ("x", "v")},
+        inputs={"u": {"range": [-1, 1]}},
+    ).model()
+    assert speeds(world) == {}
+    rows = [f"{0.02 * i:.2f},{np.sin(i / 9):.6f},{99 * np.cos(i / 9):.6f},0.{i}" for i in range(60)]
+    (tmp_path / "d.csv").write_text("\n".join(["t,x,v,u", *rows]))
+    recording = read(Measurements("d.csv", time="t", split={"by": "time"}), world, tmp_path, 0)
+    assert {c.name: c.ok for c in recording.checks}["kinematics"]
+    with pytest.raises(DataError, match=r"data\.columns\.v: null.*None of its states can be estimated"):
+        read(Measurements("d.csv", time="t", columns={"v": None}, split={"by": "time"}), world, tmp_path, 0)
 
 
 def test_smoothing_is_that_of_generalised_cross_validation() -> None:

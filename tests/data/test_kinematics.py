@@ -1,0 +1,135 @@
+"""A velocity that is not the rate of its position, or is nothing but that rate, is found and named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_sensor_checks import check, measured, motion
+
+from simpel_cli.data.kinematics import Motion, agreement, derived, difference_kind, kinematics
+
+RNG = np.random.default_rng(0)
+
+
+def pair(scale: float = 1.0, offset: float = 0.0, noise: float = 0.01, dt: float = 0.02, rows: int = 400) -> Motion:
+    t = dt * np.arange(rows)
+    pieces = []
+    for phase in (0.0, 2.0):
+        p, v = motion(t, phase=phase)
+        pieces.append(
+            (t, p + RNG.normal(0, 1.2 * noise, rows), scale * (v + offset + RNG.normal(0, 3.6 * noise, rows)))
+        )
+    return Motion("a", "w", "rad/s", pieces)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.03])
+@pytest.mark.parametrize(
+    ("scale", "text"),
+    [
+        (180 / np.pi, "times d(a)/dt: the velocity looks like degrees per s"),
+        (np.pi / 180, "the position looks like degrees"),
+        (1000.0, "the velocity looks like mm/s where the position is in m"),
+        (0.001, "the position looks like mm"),
+        (-1.0, "w is -1 times d(a)/dt: the sign is flipped"),
+        (-180 / np.pi, "the sign is flipped, and the velocity looks like degrees per s"),
+        (60.0, "one per minute"),
+        (0.02, "the velocity looks like a change per row, not per s"),
+        (1.5, "times d(a)/dt: compare their units"),
+    ],
+)
+def test_scale_and_sign(scale: float, text: str, noise: float) -> None:
+    found = kinematics([pair(scale, noise=noise)])
+    assert not found.ok
+    if text.startswith("w is -1"):
+        assert found.detail.startswith("w is -")
+        assert found.detail.endswith("the sign is flipped")
+    else:
+        assert text in found.detail
+
+
+@pytest.mark.parametrize("offset", [0.4, -1.0])
+@pytest.mark.parametrize("noise", [0.001, 0.03])
+def test_offset(offset: float, noise: float) -> None:
+    found = kinematics([pair(offset=offset, noise=noise)])
+    assert not found.ok
+    reading = float(found.detail.split("reads ")[1].split()[0])
+    assert reading == pytest.approx(offset, abs=0.1)
+    assert "rad/s where a stands still: an offset of the sensor" in found.detail
+
+
+def test_estimates_are_unbiased_and_their_errors_honest() -> None:
+    z = []
+    for _ in range(100):
+        found = agreement(pair(1.3, 0.2, noise=0.03))
+        assert found is not None
+        z.append([(found.ratio - 1.3) / (1.3 * found.ratio_error), (found.offset - 1.3 * 0.2) / found.offset_error])
+    assert np.all(np.abs(np.mean(z, axis=0)) < 0.4)
+    # neighbouring windows share a row, so that the offset is known better than their residuals tell
+    assert np.all((np.std(z, axis=0) > 0.3) & (np.std(z, axis=0) < 1.5))
+
+
+def test_slow_sampling_is_no_fault() -> None:
+    """Eight rows per swing: a difference of the position is 10 % off, the integral of the velocity is not."""
+    assert kinematics([pair(dt=2 * np.pi / 3 / 8, noise=0.001)]).ok
+
+
+def test_another_quantity_and_a_delay_are_named() -> None:
+    t = 0.02 * np.arange(400)
+    p, v = motion(t)
+    found = kinematics([Motion("a", "w", "rad/s", [(t, p, np.cos(11 * t))])])
+    assert not found.ok
+    assert "w and d(a)/dt do not go together" in found.detail
+    late = kinematics([Motion("a", "w", "rad/s", [(t[26:], p[26:], v[:-26])])])  # a quarter of a swing
+    assert not late.ok
+
+
+def test_a_constant_speed_and_rest_tell_what_they_can() -> None:
+    t = 0.02 * np.arange(300)
+    noise = RNG.normal(0, 0.001, (2, 300))
+    turning = [(t, 5 * t + noise[0], 5 + noise[1])]
+    assert kinematics([Motion("a", "w", "rad/s", turning)]).ok
+    degrees = [(t, 5 * t + noise[0], np.degrees(5 + noise[1]))]
+    assert "looks like degrees per s" in kinematics([Motion("a", "w", "deg/s", degrees)]).detail
+    for _ in range(50):
+        assert kinematics([Motion("a", "w", "rad/s", [(t, *RNG.normal(0, 0.001, (2, 300)))])]).ok
+    stuck = kinematics([Motion("a", "w", "rad/s", [(t, noise[0], motion(t)[1])])])
+    assert "w and d(a)/dt do not go together" in stuck.detail
+    assert kinematics([Motion("a", "w", "rad/s", [(t, 0 * t, 0 * t)])]).ok
+    assert kinematics([Motion("a", "w", "rad/s", [(t[:3], t[:3], t[:3])])]).ok
+
+
+@pytest.mark.parametrize("kind", ["central", "forward", "backward"])
+@pytest.mark.parametrize("noise", [0.001, 0.03])
+def test_a_differentiated_velocity_is_found(kind: str, noise: float) -> None:
+    t = 0.02 * np.arange(400)
+    p = motion(t)[0] + RNG.normal(0, noise, 400)
+    v = {
+        "central": np.gradient(p, t),
+        "forward": np.append(np.diff(p), 0) / 0.02,
+        "backward": np.insert(np.diff(p), 0, 0) / 0.02,
+    }[kind]
+    found = Motion("a", "w", "rad/s", [(t, p, v)])
+    assert difference_kind(found) == kind
+    assert f"w is the {kind} difference of a" in derived([found]).detail
+    assert "set data.columns {w: null}" in derived([found]).detail
+    rounded = found._replace(pieces=[(t, np.round(p, 5), np.round(v, 4))])
+    assert difference_kind(rounded) == kind
+
+
+@pytest.mark.parametrize("per_swing", [3, 5, 10, 100, 1000])
+def test_an_exact_velocity_is_not_taken_for_a_difference(per_swing: int) -> None:
+    """Without any noise a fine sampling makes differences almost exact; they still differ by more than the noise."""
+    t = 2 * np.pi / 3 / per_swing * np.arange(max(40, 3 * per_swing))
+    assert difference_kind(Motion("a", "w", "rad/s", [(t, *motion(t))])) is None
+    falling = Motion("h", "v", "m/s", [(t, -4.905 * t**2, -9.81 * t)])  # a difference is exact here
+    assert difference_kind(falling) is None
+
+
+def test_both_are_shown_for_a_file(tmp_path: Path) -> None:
+    a, w = motion(0.02 * np.arange(300))
+    noisy = a + RNG.normal(0, 0.003, 300)
+    recording = measured(tmp_path, [noisy, noisy], [np.gradient(noisy, 0.02)] * 2)
+    assert "w is the central difference of a" in check(recording, "derived").detail
+    degrees = measured(tmp_path, [a, a], [np.degrees(w)] * 2)
+    assert "degrees per s" in check(degrees, "kinematics").detail
+    assert check(measured(tmp_path, [a, a], [w, w]), "kinematics").ok

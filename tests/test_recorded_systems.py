@@ -1,0 +1,79 @@
+"""The simulators of the recordings against numbers that somebody else derived, and their experiments from end to end."""
+
+from pathlib import Path
+
+import casadi
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from command_line import TINY, simpel
+from systems import model
+
+from simpel_cli.transition import encoding_of, transition
+
+EXPERIMENTS = ("rc_car", "emps", "cascaded_tanks", "ball_drops", "free_pendulum")
+
+
+def step(name: str, state: list[float], inputs: list[float], **known: float) -> np.ndarray:
+    """One transition, back in physical coordinates."""
+    source = model(name, **known)
+    encoding = encoding_of(source)
+    x = encoding.to_x(np.array(state), np.array(inputs))
+    return np.asarray(encoding.decode(encoding.advance(x[: encoding.dim_state], transition(source, encoding).step(
+        jnp.asarray(x), jnp.zeros(0)))))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("state", "inputs", "after"),
+    [  # an independent implementation of the kinematic bicycle with an air drag of 1e-4 kg/m: forwards, in reverse, at rest
+        ([0.2, -0.1, 0.3, 1.5, 0.4, 0.2], [0.5, 0.8],
+         [0.2494217025, -0.08164689665, 0.3203969674, 1.486473671, 0.6282157647, 0.7814085444]),
+        ([0, 0, 0, -1.2, 0, 0], [-0.7, -0.5],
+         [-0.04046220749, 0.003034627337, 0.01972507293, -1.228213459, 0.1166023809, 0.8282630999]),
+        ([0, 0, 1, 0, 0, 0], [1, 0], [0, 0, 1, 0, 0, 0]),
+    ],
+)  # fmt: skip
+def test_rc_car_is_the_kinematic_bicycle(state: list[float], inputs: list[float], after: list[float]) -> None:
+    nominal = {"a_max": 8 / 1.65, "b": 1.5**2 / 1.65, "delta_max": 0.3, "tau": 1 / 90}
+    np.testing.assert_allclose(step("rc_car", state, inputs, **nominal), after, rtol=5e-6, atol=1e-12)
+
+
+def test_emps_settles_at_the_speed_where_friction_takes_the_force() -> None:
+    """v(t) = F/F_v + (v0 - F/F_v) exp(-F_v t/M), and the position is its integral."""
+    mass, friction, force, v0, dt = 95.1, 203.5, 100.0, -0.05, 0.01
+    end, decay = force / friction, np.exp(-friction * dt / mass)
+    speed = end + (v0 - end) * decay
+    position = 0.1 + end * dt + (v0 - end) * mass / friction * (1 - decay)
+    np.testing.assert_allclose(step("emps", [0.1, v0], [force], M=mass, F_v=friction), [position, speed], rtol=1e-9)
+
+
+def test_tanks_keep_water_and_rest_where_inflow_is_outflow() -> None:
+    known = {"k_1": 0.05, "k_2": 0.09, "k_u": 0.08}
+    rest = [(0.08 * 3 / 0.05) ** 2, (0.08 * 3 / 0.09) ** 2]
+    np.testing.assert_allclose(step("cascaded_tanks", rest, [3.0], **known), rest, rtol=1e-12)
+    rate = model("cascaded_tanks", **known).function()(casadi.DM([9, 4]), casadi.DM([2]), casadi.DM(0, 1))[0]
+    assert float(casadi.sum1(rate)) == pytest.approx(0.08 * 2 - 0.09 * 2)  # what leaves the upper one reaches the lower
+
+
+def test_a_ball_falls_along_a_parabola() -> None:
+    dt = 1 / 15
+    after = step("ball_drops", [40.0, -3.0], [])
+    np.testing.assert_allclose(after, [40 - 3 * dt - 9.81 * dt**2 / 2, -3 - 9.81 * dt], rtol=1e-12)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_experiment_runs_on_its_recording(
+    experiment: str, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SIMPEL_SHARED", str(shared))
+    small = [w for w in TINY if not w.startswith("method.steps")]
+    result = simpel(tmp_path, "fit", f"experiment={experiment}", *small, "method.steps=50", "hydra.run.dir=run")
+    assert result.code == 0, result.err
+    table = pq.read_table(tmp_path / "run" / "metrics.parquet").to_pylist()
+    rmse = {row["output"]: row["value"] for row in table if row["metric"] == "rmse" and row["split"] == "test"}
+    assert rmse
+    assert np.isfinite(list(rmse.values())).all()
+    if experiment == "emps":  # two files, found again from the run's own configuration
+        again = simpel(tmp_path, "evaluate", "run", "run.quiet=true")
+        assert again.code == 0, again.err
