@@ -30,28 +30,28 @@ def arriving(
     """
     rows = u.shape[0]
     h = dt / substeps
-    integral = jnp.concatenate([jnp.zeros((1, u.shape[1])), jnp.cumsum(u, axis=0)]) * dt
-    edges = jnp.arange(rows * substeps + 1) * h
+    integral = jnp.concatenate([jnp.zeros((1, u.shape[1]), u.dtype), jnp.cumsum(u, axis=0)]) * dt
+    edges = jnp.arange(rows * substeps + 1, dtype=u.dtype) * h
+    order = jnp.arange(1, rows * substeps + 1, dtype=u.dtype)
 
-    def one(total: Float[Array, " r"], first: Float[Array, ""], d: Float[Array, ""], tau: Float[Array, ""]) -> Array:
-        at = edges - d
-        position = jnp.clip(at / dt, 0.0, rows - 1e-9)
-        low = jnp.floor(position).astype(jnp.int32)
-        value = total[low] + (position - low) * (total[low + 1] - total[low])
-        value = value + jnp.minimum(at, 0.0) * first  # before the record the first input was held
+    def one(total: Array, first: Array, d: Array, tau: Array) -> Array:
+        at = edges - d[None]
+        position = jnp.clip(at / dt, 0.0, float(rows))
+        low = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, rows - 1)
+        value = total[low] + (position - low.astype(u.dtype)) * (total[low + 1] - total[low])
+        value = value + jnp.minimum(at, 0.0) * first[None]  # before the record the first input was held
         mean = jnp.diff(value) / h
         # exact answer of the lag to a staircase; its mean over a substep
-        ratio = h / jnp.maximum(tau, 1e-3 * h)
+        ratio = h / jnp.maximum(tau, 1e-15 * h)
         keep = jnp.exp(-ratio)
 
         def join(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
             return a[0] * b[0], a[1] * b[0] + b[1]
 
-        _, ends = jax.lax.associative_scan(join, (jnp.full_like(mean, keep), (1 - keep) * mean))
-        ends = ends + jnp.exp(-ratio * jnp.arange(1, mean.shape[0] + 1)) * mean[0]  # settled before the record
+        _, ends = jax.lax.associative_scan(join, (jnp.full_like(mean, keep), (1 - keep)[None] * mean))
+        ends = ends + jnp.exp(-ratio[None] * order) * mean[:1]  # settled before the record
         before = jnp.concatenate([mean[:1], ends[:-1]])
-        return mean + (before - mean) * (1 - keep) / ratio
+        return mean + (before - mean) * ((1 - keep) / ratio)[None]
 
-    first = u[0]
-    every = jax.vmap(one, in_axes=(1, 0, 0, 0), out_axes=1)(integral, first, delay, lag)
+    every = jax.vmap(one, in_axes=(1, 0, 0, 0), out_axes=1)(integral, u[0], delay, lag)
     return every.reshape(rows, substeps, -1)[lead:]

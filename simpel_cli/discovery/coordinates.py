@@ -54,7 +54,7 @@ class Coordinates(NamedTuple):
         q = jnp.zeros(self.nx, value.dtype).at[jnp.array(self.driven, int)].set(value[n_p + n_r : n_p + n_r + n_q])
         return value[:n_p], Noise(value[n_p : n_p + n_r], q)
 
-    def unit(self, index: int | np.ndarray, value: float | np.ndarray) -> np.ndarray:
+    def unit(self, index: Any, value: Any) -> Any:
         """Return the unit coordinate of a physical value, kept inside the bounds."""
         value = np.asarray(value, float)
         v = np.where(self.log[index], np.log(np.maximum(value, 1e-300)), value)

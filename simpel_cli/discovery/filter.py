@@ -132,7 +132,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
     h = dt / substeps
     periodic = {q.name for q in model.states if q.periodic}
-    wraps = jnp.array([name in periodic for name in augmented.measured])
+    wraps = [name in periodic for name in augmented.measured]
     delays, lags, sensor_delays = (augmented.operators[kind] for kind in (DELAY, LAG, SENSOR_DELAY))
 
     def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
@@ -201,7 +201,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
                 gain = cov @ c
                 s = c @ gain + noise.r[j] ** 2
                 e = y_k[j] - h_k[j]
-                e = jnp.where(wraps[j], (e + jnp.pi) % (2 * jnp.pi) - jnp.pi, e) - c @ (x - predicted)
+                e = (jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e) - c @ (x - predicted)
                 weight = ok_k[j] / s
                 errors.append(e)
                 variances.append(s)

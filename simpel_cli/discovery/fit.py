@@ -132,10 +132,9 @@ def _fit(
     """Levenberg-Marquardt on Fisher information, inside the unit box."""
     coordinates = coordinates.bounded(bounds)
     sd = coordinates.sd_of_prior()[index]
-    inverse_variance = jnp.where(jnp.isfinite(sd), 1 / sd**2, 0.0) * moves
-    log_norm = jnp.sum(
-        jnp.where(jnp.isfinite(sd) & moves, jnp.log(jnp.where(jnp.isfinite(sd), sd, 1.0)), 0.0)
-    ) + 0.5 * (jnp.log(2 * jnp.pi) * jnp.sum(jnp.isfinite(sd) & moves))
+    normal = jnp.isfinite(sd) & moves
+    inverse_variance = jnp.where(normal, 1 / sd**2, 0.0)
+    log_norm = jnp.sum(jnp.where(normal, jnp.log(jnp.where(normal, sd, 1.0)) + 0.5 * np.log(2 * np.pi), 0.0))
 
     def innovations(part: Array, *window: Array) -> tuple[Array, Array]:
         p, noise = coordinates.physical(z.at[index].set(jnp.where(moves, part, z[index])))
@@ -163,13 +162,11 @@ def _fit(
         losses, gradients, fishers = jax.vmap(window)(*data)
         away = part - 0.5
         loss = weight @ losses + 0.5 * jnp.sum(inverse_variance * away**2) + log_norm
-        gradient = (weight @ gradients + inverse_variance * away) * moves
+        gradient = jnp.where(moves, weight @ gradients + inverse_variance * away, 0.0)
         both_move = moves[:, None] & moves[None, :]
         fisher = jnp.where(both_move, jnp.einsum("w,wij->ij", weight, fishers), 0.0) + jnp.diag(inverse_variance)
         finite = jnp.isfinite(loss) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(fisher))
         return jnp.where(finite, loss, jnp.inf), gradient, fisher
-
-    eye = jnp.eye(index.shape[0])
 
     def propose(part: Array, gradient: Array, fisher: Array, damping: Array) -> tuple[Array, Array]:
         """Return the next trial and the gain that the quadratic model promises."""
@@ -177,7 +174,7 @@ def _fit(
         free = ~out
         matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
         scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
-        matrix = matrix + eye * jnp.where(free, damping * scale + 1e-9 * scale, 1.0)
+        matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
         step = -jnp.linalg.solve(matrix, jnp.where(free, gradient, 0.0))
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most

@@ -1,0 +1,167 @@
+"""The filter against the exact Gaussian law of a linear system, and its derivatives against differences."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.filter import Noise
+from simpel_cli.discovery.fit import Fitter, Lane
+from simpel_cli.discovery.selection import Search
+from simpel_cli.discovery.setup import Setup, setup
+from simulators.effects import Expression
+from simulators.model import Declared
+
+DT, ROWS, A, B = 0.2, 12, 0.7, 1.3
+LOAD = Expression("load", acts_on="v", term="c", parameters={"c": {"range": [-1, 1], "unit": "A", "starts": [0.1]}})
+
+
+def recording(seed: int = 0, noise: float = 0.05, load: float = 0.0) -> Recording:
+    """Episodes of dv/dt = B u - A v + load, ds/dt = v, exactly integrated."""
+    random = np.random.default_rng(seed)
+    episodes = []
+    for k in range(5):
+        u = random.normal(size=ROWS)
+        s, v, states = 0.0, random.normal(), []
+        for i in range(ROWS):
+            states.append([s, v])
+            end = (B * u[i] + load) / A
+            s += end * DT + (v - end) * (1 - np.exp(-A * DT)) / A
+            v = end + (v - end) * np.exp(-A * DT)
+        measured = np.array(states) + noise * random.normal(size=(ROWS, 2))
+        episodes.append(Episode(f"{k}", np.arange(ROWS) * DT, measured, u[:, None], np.zeros((ROWS, 0))))
+    return Recording(
+        tuple(episodes[:4]), tuple(episodes[4:]), (), {"s": noise, "v": noise}, (), (Check("c", True, ""),), ()
+    )
+
+
+def model() -> Any:
+    return Declared(
+        "lane", dt=DT,
+        states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-3, 3]}},
+        inputs={"u": {"unit": "V", "range": [-3, 3]}},
+        parameters={"a": {"unit": "1/s", "range": [0.2, 1.2]}, "b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
+        dynamics={"s": "v", "v": "b*u - a*v"},
+    ).model()  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plan() -> Setup:
+    return setup(model(), recording(), (), [LOAD], 2)
+
+
+def p_of(plan: Setup, load: float = 0.0) -> np.ndarray:
+    p = plan.augmented.neutral.copy()
+    p[:2] = A, B
+    p[[q.name for q in plan.augmented.params].index("load_v_c")] = load
+    return p
+
+
+def exact_log_likelihood(plan: Setup, w: int, r: np.ndarray, q: float, load: float, ok: np.ndarray) -> float:
+    """Log density of a window's measurements: a Gaussian vector, written down densely."""
+    windows = plan.windows
+    decay = np.exp(-A * DT)
+    f = np.array([[1.0, (1 - decay) / A], [0.0, decay]])
+    half = np.diag([0.0, q**2 * DT / 2])
+    mean, cov = windows.start[w].copy(), np.diag(windows.spread[w] ** 2)
+    means, joint = [mean], np.zeros((2 * ROWS, 2 * ROWS))
+    joint[:2, :2] = cov
+    for k in range(1, ROWS):
+        u = windows.u[w, plan.lead + k - 1, 0]
+        end = (B * u + load) / A
+        push = np.array([end * DT - end * (1 - decay) / A, end * (1 - decay)])
+        mean = f @ mean + push
+        means.append(mean)
+        rows = slice(2 * k, 2 * k + 2)
+        joint[rows, : 2 * k] = f @ joint[2 * k - 2 : 2 * k, : 2 * k]
+        joint[: 2 * k, rows] = joint[rows, : 2 * k].T
+        joint[rows, rows] = f @ (joint[2 * k - 2 : 2 * k, 2 * k - 2 : 2 * k] + half) @ f.T + half
+    kept = ok.ravel() > 0
+    total = joint + np.diag(np.tile(r**2, ROWS))
+    return multivariate_normal(np.concatenate(means)[kept], total[np.ix_(kept, kept)]).logpdf(
+        windows.y[w].ravel()[kept]
+    )
+
+
+@pytest.mark.parametrize("missing", [(), ((0, 1), (3, 0), (3, 1), (7, 1))])
+@pytest.mark.parametrize("load", [0.0, 0.4])
+def test_the_likelihood_is_that_of_the_exact_gaussian(plan: Setup, missing: tuple, load: float) -> None:
+    r, q = np.array([0.05, 0.07]), 0.3
+    ok = plan.windows.ok[1].copy()
+    for row, channel in missing:
+        ok[row, channel] = 0.0
+    data = [jnp.asarray(a[1]) for a in (plan.windows.y, plan.windows.u, plan.windows.start, plan.windows.spread)]
+    noise = Noise(jnp.asarray(r), jnp.array([0.0, q]))
+    track = plan.rule.track(
+        jnp.asarray(p_of(plan, load)), jnp.zeros(0, int), noise, data[0], jnp.asarray(ok), *data[1:]
+    )
+    e, s = np.asarray(track.innovation), np.asarray(track.variance)
+    ours = -0.5 * np.sum(ok * (np.log(2 * np.pi * s) + e**2 / s))
+    np.testing.assert_allclose(ours, exact_log_likelihood(plan, 1, r, q, load, ok), rtol=2e-6)
+
+
+def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:
+    coordinates = plan.coordinates
+    index = jnp.array([0, 1, 2, len(coordinates.low) - 3, len(coordinates.low) - 1])
+    windows = [
+        jnp.asarray(a[0])
+        for a in (plan.windows.y, plan.windows.ok, plan.windows.u, plan.windows.start, plan.windows.spread)
+    ]
+
+    @jax.jit
+    def loss(part: jax.Array) -> jax.Array:
+        z = jnp.asarray(plan.start).at[index].set(part)
+        p, noise = coordinates.physical(z)
+        track = plan.rule.track(p, jnp.where(index < p.shape[0], index, len(coordinates.low)), noise, *windows)
+        return jnp.sum(jnp.log(track.variance) + track.innovation**2 / track.variance)
+
+    at = jnp.asarray(plan.start)[index]
+    tangents = jax.jit(jax.jacfwd(loss))(at)
+    for i in range(4):
+        step = 1e-5 * jnp.eye(5)[i]
+        np.testing.assert_allclose(tangents[i], (loss(at + step) - loss(at - step)) / 2e-5, rtol=1e-5, atol=1e-6)
+    assert tangents[4] == 0  # padding
+
+
+def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() -> None:
+    found = {}
+    for load in (0.0, 0.5):
+        plan = setup(model(), recording(3, load=load), (), [LOAD], 2)
+        search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=11))
+        found[load] = search.run()
+        if load:
+            (term,) = found[load].chosen.terms
+            assert search.terms[term].effect == "load"
+            row = search.rows[term][0]
+            i = found[load].chosen.optimum.free.index(row)
+            z, span = found[load].chosen.optimum.z[row], plan.coordinates.high[row] - plan.coordinates.low[row]
+            sd = span * np.sqrt(found[load].chosen.optimum.covariance[i, i])
+            assert abs(plan.coordinates.value(row, z) - load) < 3 * sd < 0.3
+    assert found[0.0].chosen.terms == ()
+    assert found[0.0].remainder is None
+
+
+def test_evidence_of_a_nearly_linear_model_is_the_integral(plan: Setup) -> None:
+    """Two unknowns on a grid: the Laplace value against the sum."""
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=3)
+    z = plan.start.copy()
+    z[0] = plan.coordinates.unit(0, A)
+    free, weight = (1, 2), np.ones(len(plan.windows.episode))
+    (best,) = fitter([Lane(z, free, weight)])
+    assert best.converged
+    sd = np.sqrt(np.diag(best.covariance))
+    steps = np.linspace(-5, 5, 21)
+    grid = [(best.z[1] + a * sd[0], best.z[2] + b * sd[1]) for a in steps for b in steps]
+    lanes = []
+    for first, second in grid:
+        at = best.z.copy()
+        at[1], at[2] = first, second
+        lanes.append(Lane(at, (), weight))
+    losses = np.array([o.loss for o in fitter(lanes, 1)])
+    cell = (steps[1] - steps[0]) ** 2 * sd[0] * sd[1]
+    integral = np.log(np.sum(np.exp(-(losses - best.loss))) * cell) - best.loss
+    np.testing.assert_allclose(best.log_evidence, integral, atol=0.02)

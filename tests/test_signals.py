@@ -1,0 +1,69 @@
+"""Delayed and lagged inputs against their exact answers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from simpel_cli.signals import arriving
+
+DT, SUBSTEPS, LEAD = 0.1, 4, 8
+U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
+
+
+def arrived(delay: float, lag: float, u: np.ndarray = U) -> np.ndarray:
+    out = arriving(jnp.asarray(u), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
+    return np.asarray(out)[..., 0]
+
+
+def staircase(t: np.ndarray) -> np.ndarray:
+    return U[np.clip(np.floor(t / DT + 1e-12).astype(int), 0, len(U) - 1), 0]
+
+
+def means(delay: float, fine: int = 4000) -> np.ndarray:
+    """Mean over every substep of the input that was given `delay` ago, by brute force."""
+    h = DT / SUBSTEPS
+    edges = LEAD * DT + np.arange((len(U) - LEAD) * SUBSTEPS) * h
+    offsets = (np.arange(fine) + 0.5) / fine * h
+    return staircase(edges[:, None] + offsets - delay).mean(axis=1).reshape(-1, SUBSTEPS)
+
+
+def test_nothing_happens_without_delay_and_lag() -> None:
+    np.testing.assert_allclose(arrived(0.0, 0.0), np.repeat(U[LEAD:], SUBSTEPS, axis=1), rtol=1e-12)
+
+
+def test_a_delay_of_whole_rows_shifts_them() -> None:
+    np.testing.assert_allclose(
+        arrived(3 * DT, 0.0), np.repeat(U[LEAD - 3 : -3], SUBSTEPS, axis=1), rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("delay", [0.013, 0.05, 0.137, 0.21])
+def test_a_delay_below_a_row_is_the_mean_of_what_arrives(delay: float) -> None:
+    np.testing.assert_allclose(arrived(delay, 0.0), means(delay), atol=2e-3)
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.15, 0.6])
+def test_a_lag_is_the_solution_of_its_equation(lag: float) -> None:
+    h = DT / SUBSTEPS
+    w, exact = U[0, 0], []
+    for u in np.repeat(U[:, 0], SUBSTEPS):
+        keep = np.exp(-h / lag)
+        exact.append(u + (w - u) * (1 - keep) * lag / h)
+        w = u + (w - u) * keep
+    np.testing.assert_allclose(arrived(0.0, lag).ravel(), np.array(exact)[LEAD * SUBSTEPS :], rtol=1e-9)
+
+
+@pytest.mark.parametrize("at", [(0.137, 0.0), (0.06, 0.2), (0.313, 0.07)])
+def test_derivatives_are_those_of_differences(at: tuple[float, float]) -> None:
+    def total(times: jax.Array) -> jax.Array:
+        out = arriving(jnp.asarray(U), times[:1], times[1:], dt=DT, substeps=SUBSTEPS, lead=LEAD)
+        return jnp.sum(out * jnp.arange(out.size, dtype=out.dtype).reshape(out.shape))
+
+    gradient = np.asarray(jax.grad(total)(jnp.array(at)))
+    for i, step in enumerate((1e-6, 1e-6)):
+        move = np.eye(2)[i] * step
+        if at[i] == 0:
+            continue
+        slope = (total(jnp.array(at + move)) - total(jnp.array(at - move))) / (2 * step)
+        np.testing.assert_allclose(gradient[i], slope, rtol=1e-5)
