@@ -91,9 +91,9 @@ def launch(
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(entry)()
     except _Stopped as stopped:
-        failure = translated(stopped.__cause__, verb, known, user, own=False)
+        failure = translated(stopped.__cause__, verb, known, [*([user] if user else []), conf_dir()], own=False)
     except Exception as error:
-        failure = translated(error, verb, known, user, own=True)
+        failure = translated(error, verb, known, [*([user] if user else []), conf_dir()], own=True)
     finally:
         sys.argv = before
     if failure is not None:  # raised here, so that no traceback shows our detour

@@ -8,7 +8,7 @@ from simpel_cli.errors import ConfigError, did_you_mean
 
 
 def translated(
-    error: BaseException | None, verb: str, known: list[str], user: Path | None, *, own: bool
+    error: BaseException | None, verb: str, known: list[str], folders: list[Path], *, own: bool
 ) -> BaseException:
     """Return a `ConfigError` for what the user can have caused, anything else as it is.
 
@@ -16,7 +16,7 @@ def translated(
         error: what was raised.
         verb: that was launched.
         known: groups and keys of the verb.
-        user: folder with the user's groups.
+        folders: where groups are looked for, the user's first.
         own: Hydra itself raised it, not the task.
     """
     import yaml
@@ -26,11 +26,11 @@ def translated(
     assert error is not None
     message = None
     if isinstance(error, OmegaConfBaseException | HydraException):
-        message = _one_line(error, verb, known)
+        message = _one_line(error, verb, known, folders)
     elif own and isinstance(error, yaml.YAMLError):
         message = _yaml_message(error)
     elif own and isinstance(error, UnicodeDecodeError):
-        message = f"{_not_text(user)}: not UTF-8 text ({error.reason}). Save it in UTF-8."
+        message = f"{_not_text(folders[0])}: not UTF-8 text ({error.reason}). Save it in UTF-8."
     elif own and isinstance(error, OSError) and error.filename:
         message = (
             f"hydra.run.dir: cannot write to {error.filename} ({error.strerror}). Choose another: hydra.run.dir=DIR."
@@ -61,7 +61,7 @@ def unknown_root(key: str, verb: str, known: list[str]) -> str:
     return f"{key}: no such key or group of `simpel {verb}`.{did_you_mean(key, shown)} (it has: {', '.join(shown)})"
 
 
-def _one_line(error: Exception, verb: str, known: list[str]) -> str:
+def _one_line(error: Exception, verb: str, known: list[str], folders: list[Path]) -> str:
     """Say in one line what Hydra and OmegaConf say in ten."""
     text = str(error)
     cause = error.__cause__
@@ -69,6 +69,10 @@ def _one_line(error: Exception, verb: str, known: list[str]) -> str:
         group, choice, listing = found.groups()
         options = [o for o in listing.split() if o and not o.startswith("Config")]
         options = options[: options.index("search")] if "search" in options else options
+        return f"{group}: no option {choice!r}.{did_you_mean(choice, options)} (available: {', '.join(options)})"
+    if found := re.search(r"Could not load '([\w/@.\-]+)/([^'/]*)'", text):  # an entry of a list of choices
+        group, choice = found.groups()
+        options = sorted({p.stem for folder in folders for p in (folder / group).glob("*.yaml")})
         return f"{group}: no option {choice!r}.{did_you_mean(choice, options)} (available: {', '.join(options)})"
     if found := re.search(r"Could not find '([^']+)'", text):
         return f"{found[1]}: no such configuration. Groups are folders with YAML files, given with --config-dir DIR."
@@ -111,9 +115,9 @@ def _yaml_message(error: Any) -> str:
     return f"{where}not valid YAML ({getattr(error, 'problem', None) or error})."
 
 
-def _not_text(user: Path | None) -> str:
+def _not_text(user: Path) -> str:
     """First YAML file of the user's that is not UTF-8."""
-    for path in sorted(user.rglob("*.yaml")) if user is not None else []:
+    for path in sorted(user.rglob("*.yaml")):
         try:
             path.read_text(encoding="utf-8")
         except UnicodeDecodeError:

@@ -4,7 +4,6 @@ import contextlib
 import io
 import logging
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -88,12 +87,11 @@ def simpel(cwd: Path, *words: object) -> Result:
 
 
 def start(cwd: Path, *words: object, **options: object) -> subprocess.Popen[str]:
-    """Start the command as a process of its own, which Ctrl-C reaches even where the tests run in the background."""
+    """Start the command as a process of its own."""
     argv = [sys.executable, "-m", "simpel_cli.main", *map(str, words)]
     return subprocess.Popen(
-        argv, cwd=cwd, env=environment(), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
-    )  # fmt: skip
+        argv, cwd=cwd, env=environment(), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options
+    )
 
 
 def process(cwd: Path, *words: object, timeout: float = 240) -> Result:

@@ -1,12 +1,16 @@
 """Strict settings for every test: float64 available, no implicit dtype or rank promotion, shapes checked by beartype."""
 
 import os
+import signal
 from pathlib import Path
 
 import jax
 import pytest
 
 ROOT = Path(__file__).parents[1]
+
+# tests send Ctrl-C to processes that they start; a shell's background job ignores it, and would hand that on
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -11,10 +11,10 @@ from simpel_cli.discovery.augmented import Augmented, augment
 from simpel_cli.discovery.coordinates import Coordinates, coordinates_of
 from simpel_cli.discovery.filter import Filter, filter_of
 from simpel_cli.discovery.windows import Windows, windows_of
-from simpel_cli.errors import DataError
+from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import DELAY, LAG
-from simulators.model import Model
+from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
@@ -62,7 +62,10 @@ def setup(
         )
     measured = tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
     scales = scales_of(model, recording.train, measured, recording.outputs)
-    terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(model, scales)
+    try:
+        terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(model, scales)
+    except ModelError as error:
+        raise ConfigError(str(error)) from error
     augmented = augment(model, terms, measured)
     longest = max((k.high for t in terms if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
