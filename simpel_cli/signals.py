@@ -37,12 +37,13 @@ def arriving(
     def one(total: Array, first: Array, d: Array, tau: Array) -> Array:
         at = edges - d[None]
         position = jnp.clip(at / dt, 0.0, float(rows))
-        low = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, rows - 1)
+        # at a row itself the segment before it: the slope in d is then that of a delay that begins to grow
+        low = jnp.clip(jnp.ceil(position).astype(jnp.int32) - 1, 0, rows - 1)
         value = total[low] + (position - low.astype(u.dtype)) * (total[low + 1] - total[low])
         value = value + jnp.minimum(at, 0.0) * first[None]  # before the record the first input was held
         mean = jnp.diff(value) / h
         # exact answer of the lag to a staircase; its mean over a substep
-        ratio = h / jnp.maximum(tau, 1e-15 * h)
+        ratio = h / (tau + 1e-15 * h)
         keep = jnp.exp(-ratio)
 
         def join(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:

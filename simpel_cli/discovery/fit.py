@@ -46,6 +46,8 @@ class Optimum(NamedTuple):
         free: indices that moved.
         loss: negative log posterior.
         log_evidence: Laplace; -inf where the filter diverged.
+        gradient: (d,) of the loss where it came to rest.
+        fisher: (d, d) information with the prior's, unit coordinates.
         covariance: (d, d) of the free unknowns, unit coordinates.
         iterations: taken.
         converged: whether the last steps no longer helped.
@@ -55,6 +57,8 @@ class Optimum(NamedTuple):
     free: tuple[int, ...]
     loss: float
     log_evidence: float
+    gradient: np.ndarray
+    fisher: np.ndarray
     covariance: np.ndarray
     iterations: int
     converged: bool
@@ -97,25 +101,33 @@ class Fitter:
             jnp.asarray(weight),
             self._data,
         )
-        z, loss, fisher, iterations, converged = (np.asarray(a) for a in result)
+        z, loss, gradient, fisher, iterations, converged = (np.asarray(a) for a in result)
         return [
-            _optimum(z[i], lane.free, loss[i], fisher[i], int(iterations[i]), bool(converged[i]))
+            _optimum(z[i], lane.free, loss[i], gradient[i], fisher[i], int(iterations[i]), bool(converged[i]))
             for i, lane in enumerate(lanes)
         ]
 
 
 def _optimum(
-    z: np.ndarray, free: tuple[int, ...], loss: float, fisher: np.ndarray, iterations: int, converged: bool
+    z: np.ndarray,
+    free: tuple[int, ...],
+    loss: float,
+    gradient: np.ndarray,
+    fisher: np.ndarray,
+    iterations: int,
+    converged: bool,
 ) -> Optimum:
     d = len(free)
+    gradient, fisher = gradient[:d], fisher[:d, :d]
     if not np.isfinite(loss) or not np.isfinite(fisher).all():
-        return Optimum(z, free, np.inf, -np.inf, np.eye(d), iterations, False)
-    values, vectors = np.linalg.eigh(fisher[:d, :d])
+        return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), np.eye(d), iterations, False)
+    values, vectors = np.linalg.eigh(fisher)
     values = np.maximum(values, LEAST_CURVATURE)
     at = z[list(free)]
     bounded = np.sum((at < AT_BOUND) | (at > 1 - AT_BOUND))
     evidence = -loss + d / 2 * np.log(2 * np.pi) - 0.5 * np.log(values).sum() - np.log(2) * bounded
-    return Optimum(z, free, float(loss), float(evidence), (vectors / values) @ vectors.T, iterations, converged)
+    covariance = (vectors / values) @ vectors.T
+    return Optimum(z, free, float(loss), float(evidence), gradient, fisher, covariance, iterations, converged)
 
 
 def _fit(
@@ -204,5 +216,5 @@ def _fit(
         part, part, jnp.asarray(jnp.inf), jnp.zeros(width), jnp.eye(width), jnp.asarray(FIRST_DAMPING),
         jnp.asarray(0), jnp.asarray(False), jnp.asarray(0),
     )  # fmt: skip
-    _, part, loss, _, fisher, _, iteration, done, _ = jax.lax.while_loop(going, body, begin)
-    return z.at[index].set(jnp.where(moves, part, z[index])), loss, fisher, iteration, done
+    _, part, loss, gradient, fisher, _, iteration, done, _ = jax.lax.while_loop(going, body, begin)
+    return z.at[index].set(jnp.where(moves, part, z[index])), loss, gradient, fisher, iteration, done

@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.screen import promises
 from simpel_cli.discovery.setup import Setup
 from simulators.effects import Term
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 TIE = 3.0  # nats within which two names are not told apart
-SCREEN = 4  # iterations after which the hopeless are left alone
-KEPT = 14  # of a stage after the screening
+PROMISING = 0.5  # nats that the score must promise for a candidate to be fitted
+KEPT = 8  # candidates of a stage that are fitted in any case
 MOST_EFFECTS = 5
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 STARTS = 6  # of the model as it is
@@ -114,26 +115,19 @@ class Search:
         return Trial((), max(found, key=lambda o: o.log_evidence))
 
     def add(self, before: Trial, candidates: Sequence[int]) -> list[Trial]:
-        """Fit `before` with one of the candidates more, each from all of its starts; best first.
-
-        A few iterations tell the hopeless; the others go on to the end.
-        """
-        owners, lanes = [], []
-        for t in candidates:
-            terms = (*before.terms, t)
-            for lane in self.lanes(terms, t, before.optimum.z):
-                owners.append(terms)
-                lanes.append(lane)
+        """Fit `before` with one of the candidates more, each from its promising starts; best first."""
         self.tried += len(candidates)
-        screened = self.fitter(lanes, SCREEN)
-        order = sorted(range(len(lanes)), key=lambda i: -screened[i].log_evidence)
-        going = order[:KEPT] + [i for i in order[KEPT:] if self.terms[owners[i][-1]].depends_on][:KEPT]
-        final = self.fitter([Lane(screened[i].z, lanes[i].free, self.ones) for i in going])
-        best: dict[tuple[int, ...], Optimum] = {}
-        for i, optimum in [*zip(going, final, strict=True), *enumerate(screened)]:
-            if owners[i] not in best or optimum.log_evidence > best[owners[i]].log_evidence:
-                best[owners[i]] = optimum
-        trials = [Trial(terms, optimum) for terms, optimum in best.items()]
+        starts = [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
+        promised = promises(self, before, starts)
+        order = sorted(range(len(starts)), key=lambda i: -promised[i])
+        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > PROMISING]
+        found = self.fitter([starts[i][1] for i in going])
+        best: dict[int, Optimum] = {}
+        for i, optimum in zip(going, found, strict=True):
+            t = starts[i][0]
+            if t not in best or optimum.log_evidence > best[t].log_evidence:
+                best[t] = optimum
+        trials = [Trial((*before.terms, t), optimum) for t, optimum in best.items()]
         return sorted(trials, key=lambda t: -t.optimum.log_evidence)
 
     def best_named(self, trials: Sequence[Trial]) -> Trial | None:
@@ -184,23 +178,23 @@ class Search:
             current = best
             path.append(current)
             self.told(f"{self.terms[best.terms[-1]].label} +{gain:.0f}")
-        chosen, gains = self.prune(current)
+        chosen, gains, without = self.prune(current)
         if chosen.terms != current.terms:
             path = [t for t in path if set(t.terms) <= set(chosen.terms)]
             path = path if path[-1].terms == chosen.terms else [*path, chosen]
-        classes = tuple(self.rivals(chosen, i) for i in range(len(chosen.terms)))
+        classes = tuple(self.rivals(chosen, rest) for rest in without)
         return Selection(base, chosen, tuple(path), classes, tuple(stages), gains, remainder, self.tried)
 
-    def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...]]:
-        """Drop what no longer earns its place; return the rest and what each term adds to it."""
+    def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
+        """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""
         while current.terms:
             without = self.without(current)
             gains = [current.optimum.log_evidence - t.optimum.log_evidence for t in without]
             weakest = int(np.argmin(gains))
             if gains[weakest] >= ACCEPT:
-                return current, tuple(gains)
+                return current, tuple(gains), without
             current = without[weakest]
-        return current, ()
+        return current, (), []
 
     def without(self, current: Trial) -> list[Trial]:
         """Fit every set that lacks one of the terms."""
@@ -215,13 +209,10 @@ class Search:
         found = self.fitter(lanes)
         return [Trial(rest, max(found[2 * i : 2 * i + 2], key=lambda o: o.log_evidence)) for i, rest in enumerate(sets)]
 
-    def rivals(self, chosen: Trial, position: int) -> tuple[Trial, ...]:
-        """Return the trials in which another name takes the place of one chosen term and does as well."""
-        own = chosen.terms[position]
-        rest = tuple(t for t in chosen.terms if t != own)
-        others = [t for t in self.candidates(rest) if t != own]
-        smaller = Trial(rest, chosen.optimum._replace(z=self.off(chosen.optimum.z, (own,))))
-        trials = self.add(smaller, others)
+    def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
+        """Return the trials in which another name takes the place of the term that `rest` lacks, and does as well."""
+        (own,) = set(chosen.terms) - set(rest.terms)
+        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own])
         top, own_effect = chosen.optimum.log_evidence, self.terms[own].effect
         return tuple(
             t
