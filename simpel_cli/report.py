@@ -67,10 +67,10 @@ FIGURES = {
         "to either side: the model's own uncertainty, grown along the way, and the noise of one measurement.",
     ),
     "residual": (
-        "The latent force, before and after",
-        "The latent force: what has to act beside the simulator for the measurements to come about, given all of them "
-        "(smoothed, never a finite difference). Points are rows; lines are means with their 95 % band. Both simulators are "
-        "given the same process noise, so that neither is pulled to zero. One that lacks nothing leaves zero everywhere.",
+        "The latent force",
+        "What has to act beside the simulator for the measurements to come about, given all of them "
+        "(smoothed, never a finite difference). Points are rows; lines are means with their 95 % band. All are "
+        "given the same process noise, so that none is pulled to zero. One that lacks nothing leaves zero everywhere.",
     ),
     "effects": (
         "What the effects explain",

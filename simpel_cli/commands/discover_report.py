@@ -40,7 +40,7 @@ def sections_of(
         equation_section(found, before, after),
         effect_section(found),
         *pictures.values(),
-        parameter_section(tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
+        parameter_section(found, tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
         remainder_section(found),
         not_found_section(found),
         coverage_section(tables.get("coverage", {})),
@@ -76,16 +76,20 @@ def error_section(found: Mapping[str, Any], errors: Table) -> Section:
         for model in (("before", "after") if both else ("before",))
     ]
     rows.append(["log likelihood per row", "nat", *likelihood, *([""] if both else []), ""])
-    head = ["", "", "before", *(["after", "reduction"] if both else []), "noise floor"]
+    head = ["", "", *(["before", "after", "reduction"] if both else ["calibrated"]), "noise floor"]
     n = error["episodes"]
+    fitted = "the simulator with its parameters fitted to the training episodes"
     note = (
-        f"Root mean square errors on {n} held-out episode{'s' if n != 1 else ''}, in the units of the data. `Before` is the "
-        "simulator with its parameters fitted to the training episodes"
-        + (", so what is gained is the effects' alone. " if both else "; nothing was added to it. ")
+        f"Root mean square errors on {n} held-out episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
+        + (
+            " (before) and of the same with the effects (after): what is gained is the effects' alone. "
+            if both
+            else ". "
+        )
         + ("Intervals: 95 % bootstrap, resampling episodes." if n > 1 else "One episode gives no interval.")
     )
-    return {"title": "Error before and after" if both else "Error of the calibrated simulator",
-            "head": head, "rows": rows, "note": note}  # fmt: skip
+    title = "Error before and after" if both else "Error of the calibrated simulator"
+    return {"title": title, "head": head, "rows": rows, "note": note}
 
 
 def _cells(row: Mapping[str, Any], name: str, sign: str = "") -> list[str]:
@@ -97,9 +101,14 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
     old = before.get("dynamics")
     if not isinstance(old, Mapping):
         return {}
-    blocks = [{"title": "before", "lines": [[(f"d({s})/dt = {e}", False)] for s, e in old.items()]}]
-    lacks = found.get("corrected_sim_lacks") or []
-    if after is not None:
+    blocks = [
+        {
+            "title": "before" if found["effects"] else "as declared",
+            "lines": [[(f"d({s})/dt = {e}", False)] for s, e in old.items()],
+        }
+    ]
+    lacks = (found["effects"] and found.get("corrected_sim_lacks")) or []
+    if after is not None and found["effects"]:
         new = after["dynamics"]
         lines = [[(f"d({s})/dt = ", False), *marked(str(old.get(s, "")), str(e))] for s, e in new.items()]
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
@@ -151,27 +160,25 @@ def effect_section(found: Mapping[str, Any]) -> Section:
     }
 
 
-def parameter_section(parameters: Table) -> Section:
-    """Parameters before and after."""
+def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
+    """Parameters before and after; where no effect was found, calibrated."""
     rows = []
-    table = rows_of(parameters)
+    models = ("before", "after") if found["effects"] else ("before",)
+    table = [row for row in rows_of(parameters) if row["model"] in models]
     for key in dict.fromkeys((r["parameter"], r["effect"]) for r in table):
         own = {r["model"]: r for r in table if (r["parameter"], r["effect"]) == key}
         first = next(iter(own.values()))
         name = with_unit(key[0], first["unit"]) + (f", {words(key[1])}" if key[1] else "")
-        values = [
-            with_interval(own[m]["value"], own[m]["low"], own[m]["high"]) if m in own else "-"
-            for m in ("before", "after")
-        ]
+        values = [with_interval(own[m]["value"], own[m]["low"], own[m]["high"]) if m in own else "-" for m in models]
         rows.append([name, *values, f"{first['range_low']:.3g}..{first['range_high']:.3g}"])
     if not rows:
         return {}
     return {
-        "title": "Parameters before and after",
-        "head": ["", "before", "after", "declared range"],
+        "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
+        "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
         "rows": rows,
-        "note": "With 95 % intervals. A parameter that moves far was making up for what the simulator lacked; one whose "
-        "interval fills its range is not told by these data.",
+        "note": "With 95 % intervals. One whose interval fills its range is not told by these data"
+        + ("; one that moves far was making up for what the simulator lacked." if found["effects"] else "."),
     }
 
 

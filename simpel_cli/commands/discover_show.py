@@ -32,13 +32,13 @@ def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: 
     show(terminal, found, directory)
     commands = next_commands(found, directory, config)
     sim = config["sim"]
-    path = found["corrected_sim"]
+    path, noise = found["corrected_sim"], found["process_noise"]
     report = write_report(
         directory / "report.html",
         title=f"simpel discover · {sim['name']} · {config.get('choices', {}).get('data', '')}".rstrip(" ·"),
         opening=found["summary"],
-        lead=f"{KINDS[found['verdict']]} {found['candidates_tried']} candidates in {found['seconds']:.0f} s; process noise "
-        f"{found['process_noise']['before']:.2g} before and {found['process_noise']['after']:.2g} after.",
+        lead=f"{KINDS[found['verdict']]} {found['candidates_tried']} candidates in {found['seconds']:.0f} s; process noise, "
+        f"per square root of a second: {noise['before']:.2g} before, {noise['after']:.2g} after.",
         sections=sections_of(found, sim, load(directory / path) if path else None, directory),
         commands=commands,
         config=dump(config),
@@ -98,7 +98,7 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         else f"sim={chosen.get('sim', '')} data={chosen.get('data', '')}"
     )
     lines = []
-    if found["corrected_sim"]:
+    if found["corrected_sim"] and found["effects"]:
         name = Path(found["corrected_sim"]).stem
         lines.append(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={chosen.get('data', '')}")
     lines.append(f"simpel fit{own} {what}          # with the simulator as it is")

@@ -26,7 +26,7 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
     for axis, step in zip(axes, steps, strict=True):
         own = {name: column[table["step"] == step] for name, column in table.items()}
         _bars(axis, own, found)
-        best = np.flatnonzero(own["accepted"])
+        best = np.flatnonzero(own["accepted"]).tolist()
         what = f"+ {_label(own, best[0])}" if len(best) else "nothing more is accepted"
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
     _legend(figure)
@@ -55,7 +55,7 @@ def _label(own: dict[str, np.ndarray], i: int) -> str:
 
 def _bars(axis: Any, own: dict[str, np.ndarray], found: dict[str, Any]) -> None:
     gain = own["log_evidence_gain"]
-    finite = [i for i in np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable") if np.isfinite(gain[i])]
+    finite = [i for i in np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable").tolist() if np.isfinite(gain[i])]
     accepted = [i for i in finite if own["accepted"][i]]
     shown = finite[:MOST_BARS]
     if accepted and accepted[0] not in shown:
@@ -123,9 +123,11 @@ def _bracket(axis: Any, own: dict[str, np.ndarray], shown: list[int], accepted: 
     axis.text(1.012, sum(ends) / 2, f"tie:\nwithin\n{TIE:g} nat", transform=at, va="center", ha="left", fontsize=6.5)
 
 
-def draw_parameters(_: dict[str, Any], path: Path) -> Any:
+def draw_parameters(found: dict[str, Any], path: Path) -> Any:
     """Draw parameters with 95 % intervals, before and after, in their declared ranges."""
     table = columns_of(path)
+    if not found["effects"]:
+        table = {name: column[table["model"] == "before"] for name, column in table.items()}
     if not table or not len(table["parameter"]):
         return None
     keys = distinct(zip(table["parameter"], table["effect"], strict=True))
@@ -134,7 +136,7 @@ def draw_parameters(_: dict[str, Any], path: Path) -> Any:
     for place, key in enumerate(keys):
         rows = [i for i, k in enumerate(zip(table["parameter"], table["effect"], strict=True)) if k == key]
         low, high = table["range_low"][rows[0]], table["range_high"][rows[0]]
-        axis.plot([0, 1], [place, place], color="0.88", linewidth=15, solid_capstyle="butt", zorder=0)
+        axis.barh(place, 1, height=0.56, color="0.89", zorder=0)
         texts = []
         for i in rows:
             model = str(table["model"][i])
@@ -148,7 +150,7 @@ def draw_parameters(_: dict[str, Any], path: Path) -> Any:
             texts.append(with_interval(ends[1], ends[0], ends[2]))
         unit = table["unit"][rows[0]]
         axis.text(
-            1.06, place, " → ".join(texts) + (f" {unit}" if unit not in ("", "1") else ""), va="center", fontsize=8
+            1.11, place, " → ".join(texts) + (f" {unit}" if unit not in ("", "1") else ""), va="center", fontsize=8
         )
         for at, value, side in ((0, low, "right"), (1, high, "left")):
             axis.text(
@@ -163,7 +165,7 @@ def draw_parameters(_: dict[str, Any], path: Path) -> Any:
     names = [name if not effect else f"{name}  ({effect.replace('_', ' ')})" for name, effect in keys]
     axis.set_yticks(range(len(keys)), names, fontsize=8.5)
     axis.tick_params(axis="y", pad=22, length=0)
-    axis.set_xlim(-0.06, 1.75)
+    axis.set_xlim(-0.06, 1.8)
     axis.set_ylim(len(keys) - 0.5, -0.5)
     axis.set_xticks([])
     axis.spines[["left", "bottom"]].set_visible(False)

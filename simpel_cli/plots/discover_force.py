@@ -75,7 +75,7 @@ def _panels(table: dict[str, np.ndarray]) -> list[tuple[str, str]]:
     return [rank[1:] for rank in ranked if rank in kept]
 
 
-def draw_effects(_: dict[str, Any], residuals: Path, curves: Path) -> Any:
+def draw_effects(found: dict[str, Any], residuals: Path, curves: Path) -> Any:
     """Draw what the effects have to explain, along their arguments, with the fitted curves; then all of it at once.
 
     Points are the latent force with the corrected parameters and the effects switched off, less what the effects on other
@@ -83,7 +83,7 @@ def draw_effects(_: dict[str, Any], residuals: Path, curves: Path) -> Any:
     """
     table, units, curve = columns_of(residuals), units_of(residuals), columns_of(curves)
     table = {name: column[table["model"] == "without"] for name, column in table.items()}
-    if not len(table["force"]):
+    if not len(table["force"]) or not found["effects"]:
         return None
     names = [name for name in table if name not in TABLE]
     panels = [p for p in distinct(zip(curve["acts_on"], curve["argument"], strict=True)) if p[1] in names]
