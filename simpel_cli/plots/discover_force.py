@@ -111,9 +111,9 @@ def draw_effects(found: dict[str, Any], residuals: Path, curves: Path) -> Any:
         axis.legend(fontsize=7, frameon=False)
     for axis, acts_on in zip(axes[len(panels) :], moved, strict=True):
         own = _of(table, acts_on)
-        _points(axis, own["effect"], own["force"], COLOURS[1])
-        _limit(axis, own["force"])
-        _band(axis, binned(own["effect"], own["force"]), COLOURS[1], "seen: mean and 95 % band")
+        _points(axis, own["effect"], own["force"], COLOURS[1], most=5 * MOST_POINTS, alpha=0.35)
+        _limit(axis, np.concatenate([own["force"], own["effect"]]), share=0.998)
+        _band(axis, binned(own["effect"], own["force"], 2 * BINS), COLOURS[1], "seen: mean and 95 % band")
         ends = np.nanquantile(own["effect"], [0, 1])
         axis.plot(ends, ends, color=BLACK, linewidth=1.6, label="as fitted")
         unit = own["unit"][0]
@@ -128,14 +128,14 @@ def _of(table: dict[str, np.ndarray], acts_on: str) -> dict[str, np.ndarray]:
     return {name: column[own] for name, column in table.items()}
 
 
-def _points(axis: Any, x: np.ndarray, y: np.ndarray, colour: str) -> None:
-    shown = np.random.default_rng(0).permutation(len(x))[:MOST_POINTS]
-    axis.plot(x[shown], y[shown], ".", color=colour, alpha=0.22, markersize=3, markeredgewidth=0)
+def _points(axis: Any, x: np.ndarray, y: np.ndarray, colour: str, most: int = MOST_POINTS, alpha: float = 0.22) -> None:
+    shown = np.random.default_rng(0).permutation(len(x))[:most]
+    axis.plot(x[shown], y[shown], ".", color=colour, alpha=alpha, markersize=3, markeredgewidth=0)
 
 
-def _limit(axis: Any, force: np.ndarray) -> None:
+def _limit(axis: Any, force: np.ndarray, share: float = 0.96) -> None:
     """Fit the axis to nearly all points: a first row, whose state is hardly known, can be far off."""
-    low, high = np.nanquantile(force, [0.005, 0.995])
+    low, high = np.nanquantile(force, [(1 - share) / 2, (1 + share) / 2])
     low, high = min(low, 0.0), max(high, 0.0)
     margin = 0.08 * (high - low) + 1e-12
     axis.set_ylim(low - margin, high + margin)
