@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import searches
 
 from simpel_cli.commands.discover_report import equation_section, marked, next_section, untested
 from simpel_cli.commands.discover_show import next_commands, publish
@@ -15,7 +16,6 @@ from simpel_cli.console import Terminal
 from simpel_cli.plots import discover_evidence, discover_force, discover_runs, draw_discover
 from simpel_cli.plots.canvas import columns_of, units_of, with_interval
 from simpel_cli.records import write_table
-from tests import searches
 
 KINDS = ("effect", "ambiguous", "none", "unexplained")
 
@@ -76,10 +76,19 @@ def test_new_terms_are_marked() -> None:
 
 
 def test_what_no_yaml_can_state_is_said() -> None:
-    found = searches.verdict("effect") | {"corrected_sim_lacks": ["input_delay on u"]}
+    found = searches.verdict("effect") | {"corrected_sim_lacks": ["sensor_bias on omega"]}
     section = equation_section(found, searches.SIM, searches.CORRECTED)
-    assert "input delay on u" in section["after"]
+    assert "sensor bias on omega" in section["after"]
     assert equation_section(found, {"_target_": "my.Simulator", "name": "rig"}, None) == {}  # not in symbols of a YAML
+
+
+def test_a_late_input_is_part_of_the_equation() -> None:
+    late = searches.CORRECTED | {"inputs": {"u": searches.SIM["inputs"]["u"] | {"delay": "d"}}}
+    blocks = equation_section(searches.verdict("effect"), searches.SIM, late)["equations"]
+    assert len(blocks[0]["lines"]) == 1
+    assert blocks[1]["lines"][-1] == [("u acts as u(t - d)", True)]
+    known = equation_section(searches.verdict("effect"), late, late)["equations"]
+    assert known[1]["lines"][-1] == [("u acts as u(t - d)", False)]
 
 
 def test_next_experiment_of_any_form() -> None:

@@ -136,6 +136,15 @@ def test_a_diverged_window_is_nan_and_alone() -> None:
     assert np.isnan(found.moved_cov[1]).all()
 
 
+def test_rounding_below_zero_is_no_error() -> None:
+    """A covariance that rounding left without full rank, or slightly below zero, still smooths."""
+    _, y = POSITION_ONLY.simulate(10, np.random.default_rng(2))
+    track = POSITION_ONLY.track(y)
+    flat = np.array([[1.0, 1.0], [1.0, 1.0 - 1e-15]]) * 1e-6
+    found = smooth(track._replace(predicted_cov=track.predicted_cov * 0 + flat))
+    assert np.isfinite(found.mean).all()
+
+
 def force_of(system: Linear, y: np.ndarray) -> Any:
     """Latent force by the class that a search uses, with stand-ins for the model."""
     a, b = jnp.asarray(system.a), jnp.asarray(system.b)
@@ -144,12 +153,14 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
         flow=lambda p, x, u: a @ x + b + 0.0 * p[0] + 0.0 * jnp.sum(u),
         measure=lambda p, x, u: x,
         arriving=lambda p, u: u[:, None, :],
-        spread=np.ones(len(b)),
     )
     known = np.array([False])
     coordinates = Coordinates(np.zeros(1), np.ones(1), known, known, (1, 0, 0), (), len(b))
     rows = len(y)
-    windows = Windows(y[None], np.isfinite(y[None]) * 1.0, np.zeros((1, rows, 1)), system.m[None], np.zeros(1, int))
+    windows = Windows(
+        y=y[None], ok=np.isfinite(y[None]) * 1.0, u=np.zeros((1, rows, 1)), start=system.m[None], spread=np.ones((1, len(b))),
+        episode=np.zeros(1, int),
+    )  # fmt: skip
     return Forces(rule, coordinates, DT)(np.zeros(1), system.track(y), windows)
 
 

@@ -101,25 +101,34 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
     old = before.get("dynamics")
     if not isinstance(old, Mapping):
         return {}
-    blocks = [
-        {
-            "title": "before" if found["effects"] else "as declared",
-            "lines": [[(f"d({s})/dt = {e}", False)] for s, e in old.items()],
-        }
-    ]
-    lacks = (found["effects"] and found.get("corrected_sim_lacks")) or []
+    timing = _timing(before)
+    lines = [[(text, False)] for text in [*(f"d({s})/dt = {e}" for s, e in old.items()), *timing]]
+    blocks = [{"title": "before" if found["effects"] else "as declared", "lines": lines}]
+    text = ""
     if after is not None and found["effects"]:
         new = after["dynamics"]
         lines = [[(f"d({s})/dt = ", False), *marked(str(old.get(s, "")), str(e))] for s, e in new.items()]
+        lines += [[(line, line not in timing)] for line in _timing(after)]
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
-    text = ""
-    if lacks:
-        text = (
-            "No expression of states and inputs can state what has a memory or sits in a sensor, so the corrected YAML lacks: "
-            f"{', '.join(words(name) for name in lacks)}. The errors above are with it."
-        )
-    return {"title": "The equation before and after" if found["effects"] else "The equation",
-            "equations": blocks, "after": text}  # fmt: skip
+        lacks = found.get("corrected_sim_lacks")
+        if lacks:
+            text = (
+                "The corrected YAML holds the system, not its sensors; it lacks: "
+                f"{', '.join(words(name) for name in lacks)}. The errors above are with it."
+            )
+    title = "The equation before and after" if found["effects"] else "The equation"
+    return {"title": title, "equations": blocks, "after": text}
+
+
+def _timing(sim: Mapping[str, Any]) -> list[str]:
+    """Say how late and how slowly inputs act."""
+    lines = []
+    for name, node in (sim.get("inputs") or {}).items():
+        if "delay" in node:
+            lines.append(f"{name} acts as {name}(t - {node['delay']})")
+        if "lag" in node:
+            lines.append(f"{name} acts through a first-order lag with time constant {node['lag']}")
+    return lines
 
 
 def marked(old: str, new: str) -> list[tuple[str, bool]]:

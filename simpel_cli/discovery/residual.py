@@ -76,8 +76,10 @@ def _apply(a: np.ndarray, x: np.ndarray) -> np.ndarray:
 def _right_divide(a: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return a p^-1 of covariances p, scaled so that units do not matter."""
     scale = np.sqrt(np.maximum(np.diagonal(p, axis1=-2, axis2=-1), np.finfo(float).tiny))
-    outer = scale[:, :, None] * scale[:, None, :]
-    factor = np.linalg.cholesky(p / outer + JITTER * np.eye(p.shape[-1]))
+    outer, eye = scale[:, :, None] * scale[:, None, :], np.eye(p.shape[-1])
+    values, vectors = np.linalg.eigh(p / outer)
+    # of a filter that is nearly sure, rounding can leave a variance below zero
+    factor = np.linalg.cholesky((vectors * np.maximum(values, JITTER)[:, None, :]) @ _t(vectors) + JITTER * eye)
     half = np.linalg.solve(factor, _t(a / scale[:, None, :]))
     return _t(np.linalg.solve(_t(factor), half)) / scale[:, None, :]
 
