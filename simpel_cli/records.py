@@ -8,7 +8,7 @@ import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +47,15 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text)
 
 
-def write_table(path: Path, columns: dict[str, Any]) -> None:
-    """Write columns (name -> sequence) as Parquet, atomically."""
+def write_table(path: Path, columns: dict[str, Any], units: Mapping[str, str] | None = None) -> None:
+    """Write columns (name -> sequence) as Parquet, atomically; units of columns become metadata of their fields."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    table = pa.Table.from_pydict(columns)
+    fields = [f.with_metadata({"unit": units[f.name]}) if units and f.name in units else f for f in table.schema]
     with replacing(path) as temporary:
-        pq.write_table(pa.Table.from_pydict(columns), temporary)
+        pq.write_table(table.cast(pa.schema(fields)), temporary)
 
 
 class MetricStream:

@@ -6,13 +6,17 @@ from typing import Any
 
 from simpel_cli.records import write_text
 
+SCREEN, DPI = 96, 130  # pixels per inch of a page, and of the figures
+
 TEMPLATE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{{ title }}</title>
 <style>
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; color: #1b1b1b; }
 h1 { font-size: 1.5rem; margin-bottom: .2rem } h2 { font-size: 1.1rem; margin-top: 2rem }
-.lead { color: #444; margin-top: 0 } img { max-width: 100%; height: auto }
+.lead { color: #444; margin-top: 0 } .sentence { font-size: 1.15rem; font-weight: 600; margin: .6rem 0 }
+.caption { color: #444; margin: .6rem 0 .2rem } ins { background: #cfe6f5; text-decoration: none; font-weight: 600 }
+.words th { text-align: left } img { max-width: 100%; height: auto }
 .scroll { overflow-x: auto }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem }
 th, td { padding: .25rem .9rem .25rem 0; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap }
@@ -21,17 +25,24 @@ code, pre { background: #f4f4f2; padding: .1rem .3rem; border-radius: 3px; font-
 pre { padding: .7rem; overflow-x: auto } .warn { color: #a33 } .interval { color: #777; font-size: .85em }
 @media print { body { margin: 0; max-width: none } h2 { break-after: avoid } img, table { break-inside: avoid } }
 </style></head><body>
-<h1>{{ title }}</h1><p class="lead">{{ lead }}</p>
-{% for table in tables %}<h2>{{ table.title }}</h2>
-{% if table.note %}<p>{{ table.note }}</p>{% endif %}
-<div class="scroll"><table>
-{% if table.head %}<thead><tr>{% for head in table.head %}<th>{{ head }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>
-{% for row in table.rows %}<tr>{% for cell in row %}<td{% if table.text %} class="text">{{ cell }}{% else %}>
-{% set parts = cell.split(" (") %}{{ parts[0] }}{% if parts[1] %}<br><span class="interval">({{ parts[1] }}</span>{% endif %}
+<h1>{{ title }}</h1><p class="{{ "sentence" if opening else "lead" }}">{{ opening or lead }}</p>
+{% if opening %}<p class="lead">{{ lead }}</p>{% endif %}
+{% for section in sections %}<h2>{{ section.title }}</h2>
+{% if section.note %}<p>{{ section.note }}</p>{% endif %}
+{% for block in section.equations %}<p class="caption">{{ block.title }}</p><pre>
+{% for line in block.lines %}{% for text, new in line %}{% if new %}<ins>{{ text }}</ins>{% else %}{{ text }}{% endif %}
+{% endfor %}
+
+{% endfor %}</pre>{% endfor %}
+{% if section.rows %}<div class="scroll"><table{% if section.text %} class="words"{% endif %}>
+{% if section.head %}<thead><tr>{% for head in section.head %}<th>{{ head }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>
+{% for row in section.rows %}<tr>{% for cell in row %}<td{% if section.text %} class="text">{{ cell }}{% else %}>
+{% set parts = cell.split(" (", 1) %}{{ parts[0] }}{% if parts[1] %}<br><span class="interval">({{ parts[1] }}</span>{% endif %}
 {% endif %}</td>{% endfor %}
-</tr>{% endfor %}</tbody></table></div>{% endfor %}
-{% for figure in figures %}<h2>{{ figure.title }}</h2><p>{{ figure.note }}</p>
-<img alt="{{ figure.title }}" src="data:image/png;base64,{{ figure.data }}">{% endfor %}
+</tr>{% endfor %}</tbody></table></div>{% endif %}
+{% if section.image %}<img alt="{{ section.title }}" width="{{ section.width }}"
+ src="data:image/png;base64,{{ section.image }}">{% endif %}
+{% if section.after %}<p>{{ section.after }}</p>{% endif %}{% endfor %}
 <h2>Go on</h2><pre>{{ commands }}</pre>
 <h2>Configuration</h2><pre>{{ config }}</pre>
 </body></html>
@@ -55,7 +66,52 @@ FIGURES = {
         "The one whose error is the median of all free runs of the first seed. The band is two claimed standard deviations "
         "to either side: the model's own uncertainty, grown along the way, and the noise of one measurement.",
     ),
+    "residual": (
+        "The latent force",
+        "What has to act beside the simulator for the measurements to come about, given all of them "
+        "(smoothed, never a finite difference). Points are rows; lines are means with their 95 % band. All are "
+        "given the same process noise, so that none is pulled to zero. One that lacks nothing leaves zero everywhere.",
+    ),
+    "effects": (
+        "What the effects explain",
+        "The latent force with the corrected parameters and the effects switched off, along the arguments of each effect, less "
+        "what effects on other arguments do. The black curve is the fit. The last panel has all effects in one: what they say "
+        "should act against what is seen; one with a memory has no curve and shows here.",
+    ),
+    "traces": (
+        "Free runs",
+        "The test episode whose error is the median of all. After its first rows the simulator sees inputs only.",
+    ),
+    "evidence": (
+        "Evidence of every candidate",
+        "What each would add, everything else fitted anew. Amber: does as well in the final model, so that these data cannot "
+        "tell it from the accepted one. A named effect has to beat functions without a name. The axis is linear up to 10 nat, "
+        "logarithmic beyond; what is clearly excluded ends at its left edge.",
+    ),
+    "whiteness": (
+        "Whether one-step errors are white",
+        "On test episodes, each error in units of the standard deviation that the model claims for it. Inside the grey the "
+        "errors have no memory. A wrong model can pass where its process noise is large: then it is corrected in every row.",
+    ),
+    "errors": (
+        "Error by horizon",
+        "Root mean square on test episodes with 95 % intervals over episodes. No error can fall below the measurement noise.",
+    ),
 }
+
+
+def figure(path: Path) -> dict[str, Any]:
+    """Return a section with a figure, embedded.
+
+    Args:
+        path: of the PNG; its stem chooses heading and note.
+    """
+    title, note = FIGURES.get(path.stem, (path.stem.replace("_", " "), ""))
+    content = path.read_bytes()
+    width = round(
+        int.from_bytes(content[16:20], "big") * SCREEN / DPI
+    )  # of the PNG's header, so that all text is one size
+    return {"title": title, "note": note, "image": base64.b64encode(content).decode(), "width": width}
 
 
 def write_report(
@@ -63,10 +119,10 @@ def write_report(
     *,
     title: str,
     lead: str,
-    tables: list[dict[str, Any]],
-    figures: list[Path],
+    sections: list[dict[str, Any]],
     commands: list[str],
     config: str,
+    opening: str = "",
 ) -> Path:
     """Write the report.
 
@@ -74,20 +130,18 @@ def write_report(
         path: the file.
         title: heading.
         lead: one sentence below it.
-        tables: `{title, head, rows, note, text}` each; cells are shown as they are, escaped.
-        figures: PNG files, embedded.
+        sections: in order, each `{title, note, ...}` with any of: a table `{head, rows, text}`, whose cells are shown as
+            they are, escaped; `equations`, `[{title, lines}]` with a line a list of (text, whether it is new); a figure,
+            see `figure`; and a paragraph `after`.
         commands: what to type next.
         config: the resolved configuration.
+        opening: a sentence that says it all, in front of the lead.
     """
     from jinja2 import Environment
 
-    shown = []
-    for figure in figures:
-        heading, note = FIGURES.get(figure.stem, (figure.stem.replace("_", " "), ""))
-        shown.append({"title": heading, "note": note, "data": base64.b64encode(figure.read_bytes()).decode()})
     page = Environment(autoescape=True, trim_blocks=True).from_string(TEMPLATE)
     text = page.render(
-        title=title, lead=lead, tables=tables, figures=shown, commands="\n".join(commands), config=config
+        title=title, lead=lead, opening=opening, sections=sections, commands="\n".join(commands), config=config
     )
     write_text(path, text)
     return path

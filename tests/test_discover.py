@@ -90,3 +90,22 @@ def test_wrong_words(tmp_path: Path, words: tuple[str, ...], code: int, message:
     assert "Traceback" not in result.err
     assert message in result.err
     assert result.code == code
+
+
+def test_the_report_has_every_figure_and_opens_with_the_sentence(run: Path) -> None:
+    page = (run / "run" / "report.html").read_text()
+    assert page.index(verdict(run)["summary"].split(" (")[0]) < page.index("<h2>")
+    figures = {path.stem for path in (run / "run").glob("*.png")}
+    assert figures == {"residual", "effects", "traces", "evidence", "parameters", "whiteness", "errors"}
+    assert page.count("data:image/png;base64,") == len(figures)
+    assert "report.html" in (run / "out.txt").read_text()
+
+
+def test_the_latent_force_shows_the_planted_friction(run: Path) -> None:
+    """With the effect switched off, what is left steps by twice the friction where the speed changes its sign."""
+    (planted,) = json.loads((TRUTH / "hidden_pendulum.json").read_text())["effects"]
+    rows = pq.read_table(run / "run" / "residuals.parquet").to_pylist()
+    without = [r for r in rows if r["model"] == "without" and abs(r["omega"]) > 0.3]
+    left, right = ([r["force"] for r in without if (r["omega"] > 0) == side] for side in (False, True))
+    step = sum(left) / len(left) - sum(right) / len(right)
+    assert abs(step - 2 * planted["parameters"]["tau_c"]["value"]) < 0.2 * step

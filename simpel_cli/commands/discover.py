@@ -8,11 +8,13 @@ from typing import Any
 
 import jax
 
+from simpel_cli.commands.discover_show import publish
 from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump
 from simpel_cli.console import Terminal
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.corrected import corrected
+from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gate
 from simpel_cli.discovery.selection import Search, Selection
@@ -105,8 +107,10 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         write_text(path, f"# {found['summary']}\n" + dump(node))
         found |= {"corrected_sim": str(path.relative_to(directory)), "corrected_sim_lacks": left_out}
     write_text(directory / "verdict.json", json.dumps(found, indent=1))
-    _tables(directory, search, selection)
-    _show(terminal, found, directory, config)
+    shown = exhibits(search, selection, assessor, study.recording, windows, before, after)
+    for name, table in shown.items():
+        write_table(directory / f"{name}.parquet", table.columns, table.units)
+    publish(terminal, found, directory, config)
     return found
 
 
@@ -134,53 +138,3 @@ def _gated(
                 gains=tuple(selection.gains[j] for j in order),
             ), gates[:i]
     return selection, gates
-
-
-def _tables(directory: Path, search: Search, selection: Selection) -> None:
-    import numpy as np
-
-    rows = [
-        (step, search.terms[t.terms[-1]], t, t.optimum.log_evidence - stage.before.optimum.log_evidence)
-        for step, stage in enumerate(selection.stages, start=1)
-        for t in stage.trials
-    ]
-    write_table(
-        directory / "candidates.parquet",
-        {
-            "step": np.array([s for s, *_ in rows], np.int32),
-            "effect": np.array([t.effect for _, t, *_ in rows]),
-            "acts_on": np.array([t.acts_on for _, t, *_ in rows]),
-            "depends_on": np.array([",".join(t.depends_on) for _, t, *_ in rows]),
-            "expression": np.array([t.expression or t.kind for _, t, *_ in rows]),
-            "log_evidence_gain": np.array([g for *_, g in rows]),
-            "accepted": np.array([t.terms[-1] in selection.chosen.terms for _, _, t, _ in rows]),
-            "converged": np.array([t.optimum.converged for _, _, t, _ in rows]),
-        },
-    )
-
-
-def _show(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> None:
-    terminal.line()
-    terminal.line(found["summary"], style="bold")
-    error = found["error"]
-    if found["effects"]:
-        terminal.line(f"{'':<24}{'before':>12}{'after':>12}{'noise floor':>14}")
-        for key, label in (
-            ("one_step", "one step"),
-            ("horizon", f"{error['horizon_steps']} rows ahead"),
-            ("free_run", "free run"),
-        ):
-            for name in error["before"][key]:
-                old, new = error["before"][key][name], error["after"][key][name]
-                terminal.line(f"{label:<15}{name:<9}{old:>12.4g}{new:>12.4g}{found['noise_floor'][name]:>14.3g}")
-    small = ", ".join(
-        f"{n['name'].replace('_', ' ')} {n['smallest_detectable']:.2g} {n['unit']}" for n in found["not_found"][:6]
-    )
-    if small:
-        terminal.line(f"Not found, and smaller than: {small}")
-    terminal.line(f"{found['candidates_tried']} candidates, {found['seconds']:.0f} s", "time")
-    terminal.line(str(directory / "verdict.json"), "verdict")
-    if found["corrected_sim"]:
-        name = Path(found["corrected_sim"]).stem
-        data = config["choices"].get("data", "")
-        terminal.line(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={data}", "next")

@@ -12,7 +12,7 @@ from simpel_cli.console import Terminal
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.plots import draw_run
-from simpel_cli.report import write_report
+from simpel_cli.report import figure, write_report
 
 METRICS = {
     "nll": "NLL",
@@ -110,7 +110,6 @@ def publish(
     spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
     next_commands = _next(study, directory, source)
-    figures = draw_run(directory)
     what = "One step ahead" if study.system.encoding.states else "Predictions"
     tables = [table | {"title": f"{what}, held-out data", "note": NOTE}]
     if free is not None:
@@ -127,8 +126,7 @@ def publish(
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
         lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
-        tables=[*tables, run, checks],
-        figures=figures,
+        sections=[*tables, run, checks, *(figure(path) for path in draw_run(directory))],
         commands=next_commands,
         config=config,
     )

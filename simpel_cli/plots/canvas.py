@@ -89,9 +89,40 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
 
 
+def units_of(path: Path) -> dict[str, str]:
+    """Read the units of columns from the metadata of a Parquet file's fields."""
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(path)
+    return {f.name: f.metadata[b"unit"].decode() for f in schema if f.metadata and b"unit" in f.metadata}
+
+
 def distinct(values: Iterable[Any]) -> list[Any]:
     """Return distinct values in order of appearance."""
     return list(dict.fromkeys(values))
+
+
+def with_interval(value: float, low: float = np.nan, high: float = np.nan, sign: str = "") -> str:
+    """Return a number with its interval, if it has one, to two digits of the interval's half width."""
+    if not np.isfinite(value):
+        return "-"
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return f"{value:.3g}{sign}"
+    half = max((high - low) / 2, 1e-12 * max(abs(value), 1e-300))
+    decimals = max(1 - int(np.floor(np.log10(half))), 0)
+    fine = decimals <= 6 and abs(value) < 1e6
+    first, *ends = (f"{v:.{decimals}f}" if fine else f"{v:.3g}" for v in (value, low, high))
+    return f"{first}{sign} ({ends[0]}..{ends[1]})"
+
+
+def ratio_scale(axis: Any) -> None:
+    """Make the y axis logarithmic, with ticks that a person can read."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, save
+from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, ratio_scale, save
 from simpel_cli.records import read_metrics
 
 METRICS = {"nll": "test NLL [nat]", "nrmse": "test RMSE, normalised"}
@@ -105,14 +105,9 @@ def view(lines: list[Line]) -> tuple[float, float | None]:
 
 def _by_ratio(axis: Any, lines: list[Line]) -> None:
     """Scale by ratio where values differ by more than a factor of 3."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     low, high = min(line.low.min() for line in lines), max(line.high.max() for line in lines)
     if low > 0 and high > 3 * low:
-        axis.set_yscale("log")
-        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        ratio_scale(axis)
         axis.set_ylim(low / 1.2, high * 1.2)
     else:
         axis.set_ylim(0, None)

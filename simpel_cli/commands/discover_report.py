@@ -1,0 +1,291 @@
+"""What the report of a search says, section by section; it reads the verdict and the tables, nothing else."""
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.plots import draw_discover
+from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
+from simpel_cli.report import figure
+
+AT_REST = -20.0  # nats: a fit so far below the model that it contains has not come to rest, and its spread says nothing
+NEAR_RANGE = 0.95  # share of a declared range that counts as all of it
+HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "free run"}
+Section = dict[str, Any]
+Table = Mapping[str, np.ndarray]
+
+
+def sections_of(
+    found: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any] | None, directory: Path
+) -> list[Section]:
+    """Return every section in reading order.
+
+    Args:
+        found: `verdict.json`.
+        before: the `sim:` node as declared.
+        after: that of the corrected simulator; None where there is none.
+        directory: of the run, with its tables.
+    """
+    tables = {
+        p.stem: columns_of(p) for p in directory.glob("*.parquet") if p.stem in ("errors", "parameters", "coverage")
+    }
+    pictures = {p.stem: figure(p) for p in draw_discover(directory)}
+    own = pictures.pop("parameters", {})
+    parts = [
+        error_section(found, tables.get("errors", {})),
+        equation_section(found, before, after),
+        effect_section(found),
+        *pictures.values(),
+        parameter_section(found, tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
+        remainder_section(found),
+        not_found_section(found),
+        coverage_section(tables.get("coverage", {})),
+        check_section(found),
+        next_section(found),
+    ]
+    return [part for part in parts if part]
+
+
+def words(name: str) -> str:
+    """Name of an effect as a person writes it."""
+    return name.replace("_", " ")
+
+
+def rows_of(table: Table) -> list[dict[str, Any]]:
+    """Return the rows of a table."""
+    return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+
+
+def error_section(found: Mapping[str, Any], errors: Table) -> Section:
+    """Errors on held-out episodes, before and after."""
+    error = found["error"]
+    both = bool(found["effects"])
+    rows = []
+    for row in rows_of(errors):
+        label = HORIZONS[row["horizon"]].format(steps=error["horizon_steps"])
+        cells = [label, with_unit(row["output"], row["unit"]), *_cells(row, "before")]
+        if both:
+            cells += [*_cells(row, "after"), *_cells(row, "reduction", "x")]
+        rows.append([*cells, with_interval(row["noise_floor"])])
+    likelihood = [
+        with_interval(error[model]["log_likelihood_per_step"])
+        for model in (("before", "after") if both else ("before",))
+    ]
+    rows.append(["log likelihood per row", "nat", *likelihood, *([""] if both else []), ""])
+    head = ["", "", *(["before", "after", "reduction"] if both else ["calibrated"]), "noise floor"]
+    n = error["episodes"]
+    fitted = "the simulator with its parameters fitted to the training episodes"
+    note = (
+        f"Root mean square errors on {n} held-out episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
+        + (
+            " (before) and of the same with the effects (after): what is gained is the effects' alone. "
+            if both
+            else ". "
+        )
+        + ("Intervals: 95 % bootstrap, resampling episodes." if n > 1 else "One episode gives no interval.")
+    )
+    title = "Error before and after" if both else "Error of the calibrated simulator"
+    return {"title": title, "head": head, "rows": rows, "note": note}
+
+
+def _cells(row: Mapping[str, Any], name: str, sign: str = "") -> list[str]:
+    return [with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"], sign)]
+
+
+def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any] | None) -> Section:
+    """Right-hand sides before and after, with what is new marked."""
+    old = before.get("dynamics")
+    if not isinstance(old, Mapping):
+        return {}
+    timing = _timing(before)
+    lines = [[(text, False)] for text in [*(f"d({s})/dt = {e}" for s, e in old.items()), *timing]]
+    blocks = [{"title": "before" if found["effects"] else "as declared", "lines": lines}]
+    text = ""
+    if after is not None and found["effects"]:
+        new = after["dynamics"]
+        lines = [[(f"d({s})/dt = ", False), *marked(str(old.get(s, "")), str(e))] for s, e in new.items()]
+        lines += [[(line, line not in timing)] for line in _timing(after)]
+        blocks.append({"title": f"after ({after['name']})", "lines": lines})
+        lacks = found.get("corrected_sim_lacks")
+        if lacks:
+            text = (
+                "The corrected YAML holds the system, not its sensors; it lacks: "
+                f"{', '.join(words(name) for name in lacks)}. The errors above are with it."
+            )
+    title = "The equation before and after" if found["effects"] else "The equation"
+    return {"title": title, "equations": blocks, "after": text}
+
+
+def _timing(sim: Mapping[str, Any]) -> list[str]:
+    """Say how late and how slowly inputs act."""
+    lines = []
+    for name, node in (sim.get("inputs") or {}).items():
+        if "delay" in node:
+            lines.append(f"{name} acts as {name}(t - {node['delay']})")
+        if "lag" in node:
+            lines.append(f"{name} acts through a first-order lag with time constant {node['lag']}")
+    return lines
+
+
+def marked(old: str, new: str) -> list[tuple[str, bool]]:
+    """Split a new expression into pieces, each with whether it was not in the old one."""
+    a, b = (re.findall(r"\w+|\s+|\*\*|.", text) for text in (old, new))
+    pieces: list[tuple[str, bool]] = []
+    for kind, _, _, begin, end in difflib.SequenceMatcher(None, a, b, autojunk=False).get_opcodes():
+        if end > begin:
+            pieces.append(("".join(b[begin:end]), kind != "equal"))
+    return pieces
+
+
+def effect_section(found: Mapping[str, Any]) -> Section:
+    """What was added, with sizes and evidence."""
+    rows = []
+    for effect in found["effects"]:
+        values = "; ".join(
+            f"{name} = {with_interval(p['value'], p['low'], p['high'])} {p['unit'] if p['unit'] != '1' else ''}".rstrip()
+            for name, p in effect["parameters"].items()
+        )
+        gate = effect.get("held_out_gain")
+        others = [words(n) for n in effect["class"] if n != effect["name"]]
+        rows.append(
+            [f"{words(effect['name'])} on {effect['acts_on']}: {effect.get('meaning') or ''}".rstrip(": "), values,
+             f"{effect['log_evidence_gain']:.1f} nat",
+             "-" if gate is None else f"{with_interval(gate['gain'], gate['low'], gate['high'])} nat",
+             ", ".join(others) or "none"]
+        )  # fmt: skip
+    if not rows:
+        return {}
+    return {
+        "title": "What was added",
+        "head": ["effect", "size (95 %)", "evidence", "held-out gain (95 %)", "as good as it"],
+        "rows": rows,
+        "text": True,
+        "note": "Evidence: what the model loses without the effect, everything else fitted anew; 4.5 nat are asked for. "
+        "Held-out gain: log likelihood of training episodes that the parameters were not fitted to.",
+    }
+
+
+def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
+    """Parameters before and after; where no effect was found, calibrated."""
+    rows = []
+    models = ("before", "after") if found["effects"] else ("before",)
+    table = [row for row in rows_of(parameters) if row["model"] in models]
+    for key in dict.fromkeys((r["parameter"], r["effect"]) for r in table):
+        own = {r["model"]: r for r in table if (r["parameter"], r["effect"]) == key}
+        first = next(iter(own.values()))
+        name = with_unit(key[0], first["unit"]) + (f", {words(key[1])}" if key[1] else "")
+        values = [with_interval(own[m]["value"], own[m]["low"], own[m]["high"]) if m in own else "-" for m in models]
+        rows.append([name, *values, f"{first['range_low']:.3g}..{first['range_high']:.3g}"])
+    if not rows:
+        return {}
+    return {
+        "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
+        "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
+        "rows": rows,
+        "note": "With 95 % intervals. One whose interval fills its range is not told by these data"
+        + ("; one that moves far was making up for what the simulator lacked." if found["effects"] else "."),
+    }
+
+
+def remainder_section(found: Mapping[str, Any]) -> Section:
+    """What no effect explains."""
+    rest = found["remainder"]
+    if not rest:
+        return {}
+    rms = rest.get("rms", np.nan)
+    size = f", with a root mean square of {rms:.3g} {rest['unit']}" if np.isfinite(rms) else ""
+    return {
+        "title": "What is left unexplained",
+        "note": f"Something acts on d({rest['acts_on']})/dt that depends on {', '.join(rest['depends_on'])}{size}, and no "
+        "effect of the catalogue explains it. The figure of the latent force shows its shape; an effect of your own is one "
+        "YAML file with an expression (conf/effect/).",
+    }
+
+
+def reliable(found: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
+    """Split what was not found into what has a size and what was left before its fit came to rest."""
+    entries = found["not_found"]
+    good = [e for e in entries if e.get("log_evidence_gain", 0.0) > AT_REST]
+    return good, [e for e in entries if e not in good]
+
+
+def not_found_section(found: Mapping[str, Any]) -> Section:
+    """Effects that were looked for, and how small they must be."""
+    good, rest = reliable(found)
+    if not good and not rest:
+        return {}
+    rows = [
+        [f"{words(e['name'])} on {e['acts_on']}", e.get("parameter", ""),
+         f"{e['smallest_detectable']:.2g} {e['unit']}".removesuffix(" 1"),
+         f"{e['log_evidence_gain']:.1f} nat" if "log_evidence_gain" in e else "-"]
+        for e in sorted(good, key=lambda e: (e["name"], e["acts_on"]))
+    ]  # fmt: skip
+    after = ""
+    if rest:
+        names = ", ".join(f"{words(e['name'])} on {e['acts_on']}" for e in rest)
+        after = f"Left as hopeless before their fits came to rest, so that no size can be stated: {names}."
+    return {
+        "title": "What was not found, and how small it must be",
+        "head": ["effect", "parameter", "smaller than", "gain in evidence"],
+        "rows": rows,
+        "note": "An effect of the size stated would have earned its place.",
+        "after": after,
+    }
+
+
+def coverage_section(coverage: Table) -> Section:
+    """Where the data say something, and where not."""
+    rows = []
+    for row in rows_of(coverage):
+        share = (row["high"] - row["low"]) / (row["range_high"] - row["range_low"])
+        rows.append(
+            [with_unit(row["quantity"], row["unit"]), f"{row['low']:.3g}..{row['high']:.3g}",
+             f"{row['range_low']:.3g}..{row['range_high']:.3g}", f"{100 * min(share, 1.0):.0f} %"]
+        )  # fmt: skip
+    if not rows:
+        return {}
+    return {
+        "title": "What these data tested",
+        "head": ["", "training data", "declared range", "share"],
+        "rows": rows,
+        "note": "Nothing here says what happens outside of the span of the training data.",
+    }
+
+
+def untested(coverage: Table) -> list[str]:
+    """Return what the data did not reach, in words."""
+    found = []
+    for row in rows_of(coverage):
+        share = (row["high"] - row["low"]) / (row["range_high"] - row["range_low"])
+        if share < NEAR_RANGE and not row["periodic"]:
+            found.append(f"{row['quantity']} outside {row['low']:.2g}..{row['high']:.2g} {row['unit']}".rstrip())
+    return found
+
+
+def check_section(found: Mapping[str, Any]) -> Section:
+    """What was looked at in the data before any physics was blamed."""
+    rows = [(c["check"], "ok" if c["ok"] else "look", c["detail"]) for c in found["data_checks"]]
+    return {"title": "Data checks", "head": ("check", "", "what was found"), "rows": rows, "text": True} if rows else {}
+
+
+def next_section(found: Mapping[str, Any]) -> Section:
+    """Which experiment would tell tied causes apart."""
+    plan = found["next_experiment"]
+    if not plan:
+        return {}
+    if not isinstance(plan, Mapping):
+        return {"title": "Next experiment", "note": str(plan)}
+    rows = [[words(str(key)), _said(value)] for key, value in plan.items() if key != "summary"]
+    return {"title": "Next experiment", "note": plan.get("summary", ""), "rows": rows, "text": True}
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(_said(v) for v in value)
+    return str(value)

@@ -1,0 +1,107 @@
+"""The terminal's screen and the report of `discover`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.commands.discover_report import HORIZONS, reliable, rows_of, sections_of, untested, words
+from simpel_cli.config import dump, load
+from simpel_cli.console import Terminal
+from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
+from simpel_cli.report import write_report
+
+KINDS = {
+    "effect": "An effect was found.",
+    "ambiguous": "Something is missing; these data cannot tell which of several causes it is.",
+    "none": "Nothing was found to be missing.",
+    "unexplained": "Something is missing that no known effect explains.",
+}
+MOST_NAMED = 6  # effects that were not found, in the terminal
+
+
+def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> Path:
+    """Print the verdict, draw the figures, write the report, and say where things lie and what to type next.
+
+    Args:
+        terminal: to print to.
+        found: `verdict.json`, which lies in the directory together with the tables.
+        directory: of the run.
+        config: the resolved configuration.
+    """
+    show(terminal, found, directory)
+    commands = next_commands(found, directory, config)
+    sim = config["sim"]
+    path, noise = found["corrected_sim"], found["process_noise"]
+    report = write_report(
+        directory / "report.html",
+        title=f"simpel discover · {sim['name']} · {config.get('choices', {}).get('data', '')}".rstrip(" ·"),
+        opening=found["summary"],
+        lead=f"{KINDS[found['verdict']]} {found['candidates_tried']} candidates in {found['seconds']:.0f} s; process noise, "
+        f"per square root of a second: {noise['before']:.2g} before, {noise['after']:.2g} after.",
+        sections=sections_of(found, sim, load(directory / path) if path else None, directory),
+        commands=commands,
+        config=dump(config),
+    )
+    terminal.line(str(report), "report")
+    for label, line in zip(["next", *[""] * len(commands)], commands, strict=False):
+        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    return report
+
+
+def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
+    """Print the verdict on one screen."""
+    terminal.line()
+    terminal.line(found["summary"], style="bold")
+    terminal.line(_table(found, directory))
+    good, _ = reliable(found)
+    small = " · ".join(
+        f"{words(e['name'])} {e['smallest_detectable']:.2g} {e['unit']}".removesuffix(" 1") for e in good[:MOST_NAMED]
+    )
+    if small:
+        more = len(good) - MOST_NAMED
+        terminal.line(f"Not found, and smaller than: {small}" + (f" · {more} more in the report" if more > 0 else ""))
+    outside = untested(columns_of(directory / "coverage.parquet"))
+    if outside:
+        terminal.line(f"Not tested by these data: {', '.join(outside)}")
+    terminal.line(f"{found['candidates_tried']} candidates, {found['seconds']:.0f} s", "time")
+
+
+def _table(found: dict[str, Any], directory: Path) -> str:
+    """Errors before and after, for terminals."""
+    both = bool(found["effects"])
+    cells = [["", "", "before", *(["after", "reduction (95 %)"] if both else []), "noise floor"]]
+    for row in rows_of(columns_of(directory / "errors.parquet")):
+        label = HORIZONS[row["horizon"]].format(steps=found["error"]["horizon_steps"])
+        line = [label, with_unit(row["output"], row["unit"]), _number(row["before"])]
+        if both:
+            line += [
+                _number(row["after"]),
+                with_interval(row["reduction"], row["reduction_low"], row["reduction_high"], "x"),
+            ]
+        cells.append([*line, _number(row["noise_floor"])])
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"
+
+
+def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]) -> list[str]:
+    """Return commands to go on with, as they can be typed where this one was."""
+    chosen = config.get("choices") or {}
+    own = f" --config-dir {chosen['config_dir']}" if chosen.get("config_dir") else ""
+    what = (
+        f"experiment={chosen['experiment']}"
+        if chosen.get("experiment")
+        else f"sim={chosen.get('sim', '')} data={chosen.get('data', '')}"
+    )
+    lines = []
+    if found["corrected_sim"] and found["effects"]:
+        name = Path(found["corrected_sim"]).stem
+        lines.append(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={chosen.get('data', '')}")
+    lines.append(f"simpel fit{own} {what}          # with the simulator as it is")
+    if found["verdict"] in ("unexplained", "ambiguous"):
+        lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")
+    return lines

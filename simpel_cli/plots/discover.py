@@ -1,0 +1,37 @@
+"""Figures of a search, drawn from its run directory."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from simpel_cli.plots.canvas import save
+from simpel_cli.plots.discover_evidence import draw_evidence, draw_parameters
+from simpel_cli.plots.discover_force import draw_effects, draw_residual
+from simpel_cli.plots.discover_runs import draw_errors, draw_traces, draw_whiteness
+
+
+def draw_discover(directory: Path) -> list[Path]:
+    """Draw every figure whose files are there, in the order in which a report shows them; returns their paths.
+
+    Args:
+        directory: of the run, with `verdict.json` and Parquet files.
+    """
+    found = json.loads((directory / "verdict.json").read_text())
+    parts: list[tuple[str, tuple[str, ...], Callable[..., Any]]] = [
+        ("residual", ("residuals.parquet",), draw_residual),
+        ("effects", ("residuals.parquet", "effect_curves.parquet"), draw_effects),
+        ("traces", ("trajectories.parquet",), draw_traces),
+        ("evidence", ("candidates.parquet",), draw_evidence),
+        ("parameters", ("parameters.parquet",), draw_parameters),
+        ("whiteness", ("innovations.parquet",), draw_whiteness),
+        ("errors", ("errors.parquet",), draw_errors),
+    ]
+    drawn = []
+    for name, sources, draw in parts:
+        paths = [directory / source for source in sources]
+        if all(path.is_file() for path in paths):
+            figure = draw(found, *paths)
+            if figure is not None:
+                drawn.append(save(figure, directory / f"{name}.png"))
+    return drawn
