@@ -100,7 +100,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         options.horizon,
         time.perf_counter() - began,
     )
-    if selection.chosen.terms and isinstance(config["sim"].get("dynamics"), dict):
+    if len(found["effects"]) == len(selection.chosen.terms) > 0 and isinstance(config["sim"].get("dynamics"), dict):
         name, node, left_out = corrected(config["sim"], search, selection.chosen)
         path = directory / "conf" / "sim" / f"{name}.yaml"
         path.parent.mkdir(parents=True)

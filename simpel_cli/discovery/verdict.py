@@ -12,6 +12,7 @@ from simpel_cli.discovery.windows import Windows
 from simulators.effects import Term
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
+LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
 Z95 = 1.959963984540054
 
 
@@ -179,7 +180,8 @@ def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
     rows = []
     for trial in last.trials:
         term = search.terms[trial.terms[-1]]
-        if term.depends_on or trial.terms[:-1] != selection.chosen.terms:
+        gain = trial.optimum.log_evidence - last.before.optimum.log_evidence
+        if term.depends_on or trial.terms[:-1] != selection.chosen.terms or gain < LOST:
             continue
         row = search.rows[trial.terms[-1]][0]
         i = trial.optimum.free.index(row)
@@ -192,7 +194,7 @@ def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
             rows.append(
                 {"name": term.effect, "acts_on": term.acts_on, "parameter": knob.label,
                  "smallest_detectable": float(size * span), "unit": knob.unit,
-                 "log_evidence_gain": trial.optimum.log_evidence - last.before.optimum.log_evidence}
+                 "log_evidence_gain": gain}
             )  # fmt: skip
     return rows
 
