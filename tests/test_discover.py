@@ -11,12 +11,13 @@ from command_line import process
 
 TRUTH = Path(__file__).parent / "exam" / "truth"
 FEW = "effect=[viscous_friction,coulomb_friction,input_delay]"
+QUICK = ("method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("discover")
-    result = process(folder, "discover", "experiment=hidden_pendulum", FEW, "hydra.run.dir=run", "--strict")
+    result = process(folder, "discover", "experiment=hidden_pendulum", FEW, *QUICK, "hydra.run.dir=run", "--strict")
     assert result.code == 0, result.err
     (folder / "out.txt").write_text(result.out)
     return folder
@@ -63,6 +64,20 @@ def test_every_candidate_is_on_record(run: Path) -> None:
     rows = pq.read_table(run / "run" / "candidates.parquet").to_pylist()
     assert {r["effect"] for r in rows} == {"viscous_friction", "coulomb_friction", "input_delay", "unnamed"}
     assert [r["effect"] for r in rows if r["accepted"]] == ["coulomb_friction"]
+
+
+def test_both_simulators_are_compared_as_priors(run: Path) -> None:
+    found = verdict(run)["as_prior"]
+    assert set(found) == {"before", "after"}
+    for by_size in found.values():
+        assert set(by_size) == {"20", "50"}
+        for metrics in by_size.values():
+            assert {"nll", "nrmse", "free_run_rmse@1s phi"} <= set(metrics)
+            assert all(low <= median <= high for median, low, high in metrics.values())
+    rows = pq.read_table(run / "run" / "metrics.parquet").to_pylist()
+    assert {r["sim"] for r in rows} == {"pendulum", "pendulum_with_coulomb_friction"}
+    assert {(r["command"], r["n_train"]) for r in rows} == {("discover", 20), ("discover", 50)}
+    assert {r["seed"] for r in rows} == set(range(5))
 
 
 def test_fit_reads_the_corrected_simulator(run: Path) -> None:

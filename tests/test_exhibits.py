@@ -34,7 +34,8 @@ def shown() -> dict[str, Exhibit]:
                 z[search.rows[t][0]] = plan.coordinates.unit(search.rows[t][0], value)
         z[-2] = plan.coordinates.unit(len(z) - 2, q)
         free = search.free(terms)
-        return Trial(terms, Optimum(z, free, 0.0, evidence, 1e-4 * np.eye(len(free)), 5, True))
+        eye = np.eye(len(free))
+        return Trial(terms, Optimum(z, free, 0.0, evidence, np.zeros(len(free)), 1e4 * eye, 1e-4 * eye, 5, True))
 
     base, one, other, both = (
         trial((), 0.0, 0.5),

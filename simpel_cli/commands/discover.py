@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from simpel_cli.commands.close import close, memory_of
 from simpel_cli.commands.discover_show import publish
 from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump
@@ -105,7 +106,13 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         path = directory / "conf" / "sim" / f"{name}.yaml"
         path.parent.mkdir(parents=True)
         write_text(path, f"# {found['summary']}\n" + dump(node))
-        found |= {"corrected_sim": str(path.relative_to(directory)), "corrected_sim_lacks": left_out}
+        found |= {
+            "corrected_sim": str(path.relative_to(directory)),
+            "corrected_sim_lacks": left_out,
+            "stack_actions": memory_of(node),
+        }
+        if config.get("close", True) and len(left_out) < len(found["effects"]):
+            found["as_prior"] = close(config, node, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(found, indent=1))
     shown = exhibits(search, selection, assessor, study.recording, windows, before, after)
     for name, table in shown.items():

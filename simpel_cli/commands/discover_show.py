@@ -100,7 +100,8 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
     lines = []
     if found["corrected_sim"] and found["effects"]:
         name = Path(found["corrected_sim"]).stem
-        lines.append(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={chosen.get('data', '')}")
+        past = f" data.stack_actions={found['stack_actions']}" if found.get("stack_actions") else ""
+        lines.append(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={chosen.get('data', '')}{past}")
     lines.append(f"simpel fit{own} {what}          # with the simulator as it is")
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")

@@ -1,0 +1,95 @@
+"""Closing the loop: SimPEL with the simulator as it was and with the corrected one as prior, on the same few transitions."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli import loop
+from simpel_cli.commands.judge import judge
+from simpel_cli.commands.study import STRETCH, open_study, posteriors, prepare
+from simpel_cli.console import Terminal
+from simpel_cli.data import transitions
+from simpel_cli.nodes import build
+from simpel_cli.records import write_metrics
+
+SIZES = (20, 50)  # training transitions
+SEEDS = 5
+SHOWN = ("nll", "nrmse")  # joint, beside the free runs
+
+Summary = dict[str, dict[str, dict[str, list[float]]]]
+
+
+def memory_of(sim: dict[str, Any]) -> int:
+    """Return the number of past inputs that a transition of a declared simulator needs."""
+    model = build(sim, "sim").model()
+    return int(-(-model.memory() // model.dt))
+
+
+def close(
+    config: dict[str, Any], corrected: dict[str, Any], directory: Path, data_folder: Path, terminal: Terminal
+) -> Summary:
+    """Fit SimPEL with both simulators and judge both on the test episodes; writes `metrics.parquet`.
+
+    Both get the same transitions, past inputs, method and seeds.
+
+    Args:
+        config: of the search, resolved.
+        corrected: the `sim:` node of the corrected simulator.
+        directory: of the run; each fit's tables go below `close/`.
+        data_folder: folder of the data YAML.
+        terminal: for a line per fit.
+
+    Returns:
+        before|after -> training transitions -> metric -> [median, smallest, largest] over seeds.
+    """
+    stack = max(memory_of(corrected), memory_of(config["sim"]), int(config["data"].get("stack_actions") or 0))
+    own_run = {**(config.get("run") or {}), "precision": "float32", "seeds": SEEDS, "quiet": True}
+    rows: list[dict[str, Any]] = []
+    found: Summary = {"before": {}, "after": {}}
+    for n in SIZES:
+        for label, sim in (("before", config["sim"]), ("after", corrected)):
+            data = config["data"] | {"n_train": n, "stack_actions": stack}
+            study = open_study(config | {"sim": sim, "data": data, "run": own_run}, data_folder)
+            if len(transitions(study.recording.train, stack).row) < n:
+                return found
+            fitted = prepare(study)
+            program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
+            *_, last = loop.train(program, study.method.steps)
+            folder = directory / "close" / f"{label}_{n}"
+            folder.mkdir(parents=True)
+            spread = np.asarray(fitted.normaliser.y_std)
+            judged = judge(study, posteriors(study, fitted, last.state), spread, folder, study.method.steps)
+            same = study.constants | {"run": directory.name, "command": "discover", "n_train": n}
+            rows += [same | row for row in judged.rows]
+            found[label][str(n)] = _summary(judged.rows)
+        old, new = (found[label][str(n)] for label in ("before", "after"))
+        terminal.line(f"{n} transitions: {_compared(old, new)}", "as a prior")
+    write_metrics(directory / "metrics.parquet", rows, {})
+    return found
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, list[float]]:
+    """Median, smallest and largest seed of what is shown."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        metric, output = row["metric"], row.get("output", "")
+        if metric in SHOWN and output == "joint":
+            values.setdefault(metric, []).append(row["value"])
+        elif metric.startswith("free_run_rmse@") and not metric.endswith(("_low", "_high")):
+            values.setdefault(f"{metric} {output}", []).append(row["value"])
+    return {k: [float(np.median(v)), float(np.min(v)), float(np.max(v))] for k, v in values.items()}
+
+
+def _compared(old: dict[str, list[float]], new: dict[str, list[float]]) -> str:
+    """Say before and after in one line: NLL, and the longest free run."""
+    longest = [k for k in old if k.startswith("free_run_rmse@")]
+    last = max((float(k.split("@")[1].split("s ")[0]) for k in longest), default=0.0)
+    shown = ["nll", *(k for k in longest if float(k.split("@")[1].split("s ")[0]) == last)]
+    names = {"nll": "NLL"} | {k: k.replace("free_run_rmse@", "free run ") for k in longest}
+    return ", ".join(f"{names[k]} {_spread(old[k])} -> {_spread(new[k])}" for k in shown if k in new)
+
+
+def _spread(values: list[float]) -> str:
+    median, low, high = values
+    return f"{median:.3g} ({low:.3g}..{high:.3g})"
