@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import searches
 
-from simpel_cli.commands.discover_report import equation_section, marked, next_section, untested
+from simpel_cli.commands.discover_report import equation_section, marked, next_section, prior_section, untested
 from simpel_cli.commands.discover_show import next_commands, publish
 from simpel_cli.console import Terminal
 from simpel_cli.plots import discover_evidence, discover_force, discover_runs, draw_discover
@@ -190,3 +190,15 @@ def test_bins_average_and_say_how_surely() -> None:
     np.testing.assert_allclose(found.mean, [0, 1, 4])
     np.testing.assert_allclose(found.error, np.sqrt(50 / 49) / np.sqrt(50))
     assert len(discover_force.binned(np.array([np.nan]), np.ones(1)).at) == 0
+
+
+def test_priors_are_compared_size_by_size() -> None:
+    fits = {
+        "before": {"20": {"nll": [-9.07, -9.15, -8.93], "free_run_rmse@1s phi": [0.08, 0.07, 0.14]}},
+        "after": {"20": {"nll": [-9.26, -9.30, -9.09], "free_run_rmse@1s phi": [0.05, 0.04, 0.06]}},
+    }
+    section = prior_section({"as_prior": fits})
+    assert [row[:2] for row in section["rows"]] == [["20 transitions", "NLL"], ["20 transitions", "free run 1s phi"]]
+    assert "-9.07" in section["rows"][0][2]
+    assert "-9.26" in section["rows"][0][3]
+    assert prior_section({}) == {}

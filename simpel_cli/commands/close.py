@@ -64,7 +64,7 @@ def close(
             rows += [same | row for row in judged.rows]
             found[label][str(n)] = _summary(judged.rows)
         old, new = (found[label][str(n)] for label in ("before", "after"))
-        terminal.line(f"{n} transitions: {_compared(old, new)}", "as a prior")
+        terminal.line(f"{n} transitions: {_compared(old, new)}", "prior")
     write_metrics(directory / "metrics.parquet", rows, {})
     return found
 

@@ -40,6 +40,7 @@ def sections_of(
         equation_section(found, before, after),
         effect_section(found),
         *pictures.values(),
+        prior_section(found),
         parameter_section(found, tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
         remainder_section(found),
         not_found_section(found),
@@ -264,6 +265,24 @@ def untested(coverage: Table) -> list[str]:
         if share < NEAR_RANGE and not row["periodic"]:
             found.append(f"{row['quantity']} outside {row['low']:.2g}..{row['high']:.2g} {row['unit']}".rstrip())
     return found
+
+
+def prior_section(found: Mapping[str, Any]) -> Section:
+    """SimPEL with the old and the corrected simulator as prior, on the same few transitions."""
+    fits = found.get("as_prior") or {}
+    rows = []
+    for size, metrics in (fits.get("before") or {}).items():
+        for metric, old in metrics.items():
+            if new := (fits.get("after") or {}).get(size, {}).get(metric):
+                name = {"nll": "NLL", "nrmse": "normalised RMSE"}.get(
+                    metric, metric.replace("free_run_rmse@", "free run ")
+                )
+                rows.append([f"{size} transitions", name, with_interval(*old), with_interval(*new)])
+    note = (
+        "SimPEL on the same few training transitions, judged on the test episodes: median, smallest and largest seed."
+    )
+    head = ("", "", "simulator as it was", "corrected simulator")
+    return {"title": "As a prior for SimPEL", "head": head, "rows": rows, "note": note} if rows else {}
 
 
 def check_section(found: Mapping[str, Any]) -> Section:
