@@ -6,14 +6,15 @@ UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
 PYTHON ?= python3
 STAMP := $(VENV)/.installed
 WORKERS ?= 2
+SETS ?= 600
 # worlds whose effects no YAML of conf/ names
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench lock data clean
+.PHONY: help install demo test test-slow lint format bench exam lock data clean reproduce-metrics_vs_n_train
 
 help: ## Show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-12s\033[0m %s\n", $$1, $$2}'
+	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
 
 install: $(STAMP) ## Set up .venv from the lock (brings uv along if it is not there)
 
@@ -44,6 +45,14 @@ format: install ## Format the code
 
 bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
+
+exam: install ## Give `simpel discover` the blind exam (SETS=600)
+	$(BIN)/python -m tests.exam --sets $(SETS) --out runs/exam/$$(date +%Y%m%d-%H%M%S)
+
+reproduce-metrics_vs_n_train: install ## Make the README's figure anew (36 fits)
+	$(BIN)/simpel sweep experiment=pendulum method=simpel,simpel_only_sim,fsvgd data.n_train=10,20,40,80 'run.seed=range(3)' \
+		hydra.sweep.dir=runs/reproduce/metrics_vs_n_train-$(shell date +%Y%m%d-%H%M%S)
+	@echo "the figure lies in runs/reproduce; the README shows docs/figures/metrics_vs_n_train.png"
 
 lock: ## Write uv.lock against the public index only
 	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config
