@@ -17,6 +17,7 @@ import casadi
 from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, did_you_mean, parse, symbols_used
 
 PRIORS = ("uniform", "normal", "lognormal")
+TIMES = ("delay", "lag")  # of an input
 
 
 class ModelError(ValueError):
@@ -79,11 +80,8 @@ class Model:
     def memory(self) -> float:
         """Return how far back inputs act, s: the longest delay and three time constants of the longest lag."""
         high = {q.name: q.high for q in self.params} | self.fixed
-        longest = [
-            max((high[v] if isinstance(v, str) else v for v in times.values()), default=0.0)
-            for times in (self.delay, self.lag)
-        ]
-        return longest[0] + 3 * longest[1]
+        ends = [[high[v] if isinstance(v, str) else v for v in times.values()] for times in (self.delay, self.lag)]
+        return max(ends[0], default=0.0) + 3 * max(ends[1], default=0.0)
 
     def function(self) -> casadi.Function:
         """Return the CasADi function (x, u, p) -> (dx, y); every argument is a column, empty ones are 0 x 1.
@@ -155,8 +153,7 @@ class Declared:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
         states = tuple(_variable(f"sim.states.{name}", name, node) for name, node in self.states.items())
-        actuators = {name: _without(f"sim.inputs.{name}", node, ("delay", "lag")) for name, node in self.inputs.items()}
-        inputs = tuple(_variable(f"sim.inputs.{name}", name, node) for name, (node, _) in actuators.items())
+        inputs = tuple(_variable(f"sim.inputs.{name}", name, node, TIMES) for name, node in self.inputs.items())
         outputs = tuple(_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
         if not states and not outputs:
             raise ModelError(
@@ -188,8 +185,8 @@ class Declared:
             output=lambda x, u, p: terms("outputs", measured, x, u, p),
             gap=self._gap(),
             fixed=fixed,
-            delay=_times("delay", actuators, params, fixed),
-            lag=_times("lag", actuators, params, fixed),
+            delay=_times("delay", self.inputs, params, fixed),
+            lag=_times("lag", self.inputs, params, fixed),
         )
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
@@ -342,8 +339,8 @@ def _range(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
     return low, high
 
 
-def _variable(path: str, name: str, node: Any) -> Quantity:
-    _keys(path, node, ("unit", "range", "periodic"))
+def _variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -> Quantity:
+    _keys(path, node, ("unit", "range", "periodic", *more))
     periodic = node.get("periodic", False)
     if not isinstance(periodic, bool):
         raise ModelError(f"{path}.periodic: {periodic!r} is not allowed; write true or false")
@@ -355,25 +352,16 @@ def _variable(path: str, name: str, node: Any) -> Quantity:
     return Quantity(name, _unit(path, node), *_range(path, node), periodic=periodic)
 
 
-def _without(path: str, node: Any, keys: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split a mapping into the rest and the named keys."""
-    _mapping(path, node)
-    return {k: v for k, v in node.items() if k not in keys}, {k: v for k, v in node.items() if k in keys}
-
-
 def _times(
-    key: str,
-    actuators: Mapping[str, tuple[Any, Mapping[str, Any]]],
-    params: tuple[Quantity, ...],
-    fixed: dict[str, float],
+    key: str, inputs: Mapping[str, Any], params: tuple[Quantity, ...], fixed: dict[str, float]
 ) -> dict[str, float | str]:
     """Read the delays or lags of the inputs: a number, or the name of a parameter."""
     known = {q.name: q.low for q in params} | fixed
     found: dict[str, float | str] = {}
-    for name, (_, own) in actuators.items():
-        if key not in own:
+    for name, node in inputs.items():
+        if key not in node:
             continue
-        path, value = f"sim.inputs.{name}.{key}", own[key]
+        path, value = f"sim.inputs.{name}.{key}", node[key]
         if isinstance(value, str) and value not in known:
             _unknown(path, f"{value!r} is neither a number (s) nor a parameter", value, known)
         least = known[value] if isinstance(value, str) else _number(path, value)

@@ -269,3 +269,32 @@ def test_a_python_model_with_wrong_rows_is_refused() -> None:
         ModelError, match=r"short: dx has shape \(1, 1\), expected \(2, 1\): one row for each of \['a', 'b'\]"
     ):
         model.function()
+
+
+LATE = {
+    "name": "late", "dt": 0.1,
+    "states": {"v": {"unit": "m/s", "range": [-2, 2]}},
+    "parameters": {"d": {"unit": "s", "range": [0.05, 0.15]}, "T": 0.2},
+    "dynamics": {"v": "u - v"},
+}  # fmt: skip
+
+
+class TestLateInputs:
+    def test_a_delay_is_a_number_or_a_parameter(self) -> None:
+        inputs = {"u": {"unit": "V", "range": [-1, 1], "delay": "d", "lag": "T"}}
+        model = Declared(**LATE, inputs=inputs).model()
+        assert (model.delay, model.lag) == ({"u": "d"}, {"u": "T"})
+        assert model.memory() == pytest.approx(0.15 + 3 * 0.2)
+
+    @pytest.mark.parametrize(
+        ("own", "message"),
+        [
+            ({"delay": -0.1}, "sim.inputs.u.delay: -0.1 s is negative"),
+            ({"lag": "tau"}, "sim.inputs.u.lag: 'tau' is neither a number (s) nor a parameter"),
+            ({"dealy": 0.1}, "dealy"),
+        ],
+    )
+    def test_wrong_ones_are_refused(self, own: dict, message: str) -> None:
+        with pytest.raises(ModelError) as caught:
+            Declared(**LATE, inputs={"u": {"unit": "V", "range": [-1, 1], **own}}).model()
+        assert message in str(caught.value)

@@ -9,8 +9,9 @@ from systems import SYMBOLIC, model
 
 from simpel_cli.casadi_jax import to_jax
 from simpel_cli.domain import Domain
+from simpel_cli.errors import ConfigError
 from simpel_cli.transition import encoding_of, transition
-from simulators.model import Model
+from simulators.model import Declared, Model
 from simulators.parameters import draw
 
 NOMINAL = {"m": 1.0, "l": 1.0, "C_m": 1.0}
@@ -111,3 +112,28 @@ def test_simulators_step_in_batches(sim: str) -> None:
     assert np.isfinite(y).all()
     after = x[:, : encoding.dim_state] + y[:, : encoding.dim_state]
     np.testing.assert_allclose(encoding.encode(encoding.decode(after)), after, atol=1e-12)
+
+
+def late(delay: float, lag: float) -> Model:
+    return Declared(
+        "late", dt=0.1, substeps=50,
+        states={"v": {"unit": "m/s", "range": [-2, 2]}},
+        inputs={"u": {"unit": "V", "range": [-1, 1], "delay": delay, "lag": lag}},
+        parameters={"a": 0.7}, dynamics={"v": "u - a*v"},
+    ).model()  # fmt: skip
+
+
+def test_a_transition_with_a_delay_is_the_exact_solution() -> None:
+    model = late(0.13, 0.0)
+    step = transition(model, encoding_of(model, stack=2)).step
+    v, (oldest, older, _) = 0.4, (0.9, -0.5, 0.2)
+    for u, seconds in ((oldest, 0.03), (older, 0.07)):  # what arrives in 0.1 s
+        v = u / 0.7 + (v - u / 0.7) * np.exp(-0.7 * seconds)
+    found = step(jnp.array([0.4, 0.9, -0.5, 0.2]), jnp.zeros(0))
+    np.testing.assert_allclose(found, [v - 0.4], rtol=2e-3)
+
+
+def test_a_delay_needs_the_inputs_of_the_past() -> None:
+    model = late(0.13, 0.0)
+    with pytest.raises(ConfigError, match=r"data\.stack_actions: 1, but .* Use data\.stack_actions=2\."):
+        transition(model, encoding_of(model, stack=1))
