@@ -58,6 +58,46 @@ def to_jax(function: casadi.Function) -> Callable[..., tuple[Array, ...]]:
     return converted
 
 
+def to_jax_rows(function: casadi.Function) -> Callable[..., tuple[Array, ...]]:
+    """Convert a function of columns to a JAX function of many points at once, which are its trailing axes.
+
+    With the points last, every operation of an SX function is one pass over contiguous numbers.
+
+    Args:
+        function: its inputs are dense columns; of its outputs the structural nonzeros are returned.
+
+    Returns:
+        A function of arrays (n, ...) that returns, per output, the array (nonzeros, ...), column by column.
+
+    """
+    if function.class_name() != "SXFunction":
+        return _rows_of_points(function)
+    program = _program(function, guarded=False)
+
+    def converted(*arguments: Any) -> tuple[Array, ...]:
+        arrays = [jnp.asarray(a) for a in arguments]
+        return tuple(program(list(arrays), _dtype(function, arrays)))
+
+    return converted
+
+
+def _rows_of_points(function: casadi.Function) -> Callable[..., tuple[Array, ...]]:
+    """Do the same for matrix expressions, point by point under `vmap`."""
+    program = _program(function, guarded=False)
+
+    def point(*arrays: Array) -> tuple[Array, ...]:
+        return tuple(program(list(arrays), _dtype(function, list(arrays))))
+
+    def converted(*arguments: Any) -> tuple[Array, ...]:
+        arrays = [jnp.asarray(a) for a in arguments]
+        run = point
+        for _ in range(max(a.ndim for a in arrays) - 1):
+            run = jax.vmap(run, in_axes=-1, out_axes=-1)
+        return run(*arrays)
+
+    return converted
+
+
 def checked(
     function: casadi.Function,
     ranges: Sequence[Sequence[tuple[float, float]]],
@@ -212,10 +252,21 @@ def _interpreter(function: casadi.Function, guarded: bool) -> Program:
                 work[step.writes[0]] = arguments[step.argument][step.offset : step.offset + step.node]
             else:
                 results[step.argument][step.offset] = jnp.atleast_1d(jnp.asarray(work[step.reads[0]], dtype))
-        empty = jnp.zeros(0, dtype)
-        return [jnp.concatenate([parts[offset] for offset in sorted(parts)] or [empty]) for parts in results]
+        # trailing axes, if any, are points; a constant is the same at all of them
+        points = jnp.shape(arguments[0])[1:] if arguments else ()
+        empty = jnp.zeros((0, *points), dtype)
+        return [
+            jnp.concatenate([_at_all(parts[offset], points) for offset in sorted(parts)] or [empty])
+            for parts in results
+        ]
 
     return run
+
+
+def _at_all(value: Array, points: tuple[int, ...]) -> Array:
+    return (
+        value if value.ndim > 1 or not points else jnp.broadcast_to(value.reshape(1, *(1,) * len(points)), (1, *points))
+    )
 
 
 def _map(function: casadi.Function, guarded: bool) -> Program:

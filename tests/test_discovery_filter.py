@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.filter import Noise
+from simpel_cli.discovery.filter import Moving, Noise, still
 from simpel_cli.discovery.fit import Fitter, Lane
 from simpel_cli.discovery.selection import Search
 from simpel_cli.discovery.setup import Setup, setup
@@ -96,9 +96,7 @@ def test_the_likelihood_is_that_of_the_exact_gaussian(plan: Setup, missing: tupl
         ok[row, channel] = 0.0
     data = [jnp.asarray(a[1]) for a in (plan.windows.y, plan.windows.u, plan.windows.start, plan.windows.spread)]
     noise = Noise(jnp.asarray(r), jnp.array([0.0, q]))
-    track = plan.rule.track(
-        jnp.asarray(p_of(plan, load)), jnp.zeros(0, int), noise, data[0], jnp.asarray(ok), *data[1:]
-    )
+    track = plan.rule.track(still(jnp.asarray(p_of(plan, load))), noise, data[0], jnp.asarray(ok), *data[1:])
     e, s = np.asarray(track.innovation), np.asarray(track.variance)
     ours = -0.5 * np.sum(ok * (np.log(2 * np.pi * s) + e**2 / s))
     np.testing.assert_allclose(ours, exact_log_likelihood(plan, 1, r, q, load, ok), rtol=2e-6)
@@ -112,19 +110,35 @@ def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None
         for a in (plan.windows.y, plan.windows.ok, plan.windows.u, plan.windows.start, plan.windows.spread)
     ]
 
-    @jax.jit
-    def loss(part: jax.Array) -> jax.Array:
-        z = jnp.asarray(plan.start).at[index].set(part)
+    def loss(z: jax.Array, row: jax.Array) -> jax.Array:
         p, noise = coordinates.physical(z)
-        track = plan.rule.track(p, jnp.where(index < p.shape[0], index, len(coordinates.low)), noise, *windows)
+        value = p[jnp.minimum(row, p.shape[0] - 1)]
+        track = plan.rule.track(Moving(p, row, value), noise, *windows)
         return jnp.sum(jnp.log(track.variance) + track.innovation**2 / track.variance)
 
-    at = jnp.asarray(plan.start)[index]
-    tangents = jax.jit(jax.jacfwd(loss))(at)
-    for i in range(4):
-        step = 1e-5 * jnp.eye(5)[i]
-        np.testing.assert_allclose(tangents[i], (loss(at + step) - loss(at - step)) / 2e-5, rtol=1e-5, atol=1e-6)
-    assert tangents[4] == 0  # padding
+    at = jnp.asarray(plan.start)
+    parameters = coordinates.sizes[0]
+    slope = jax.jit(lambda step, row: jax.jvp(lambda z: loss(z, row), (at,), (step,))[1])
+    plain = jax.jit(lambda z: loss(z, jnp.asarray(parameters)))
+    for i in index[:4]:
+        step = jnp.zeros(len(at)).at[i].set(1.0)
+        row = jnp.where(i < parameters, i, parameters)
+        difference = (plain(at + 1e-5 * step) - plain(at - 1e-5 * step)) / 2e-5
+        np.testing.assert_allclose(slope(step, row), difference, rtol=1e-5, atol=1e-6)
+    assert slope(jnp.zeros(len(at)).at[index[4]].set(1.0), jnp.asarray(parameters)) == 0  # padding
+
+
+def test_a_batch_has_the_losses_and_slopes_of_its_windows_one_by_one(plan: Setup) -> None:
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=4)
+    free, count = (0, 1, 2, len(plan.start) - 2), len(plan.windows.episode)
+    single = fitter([Lane(plan.start, free, np.eye(count)[w]) for w in range(count)], 1)
+    (together,) = fitter([Lane(plan.start, free, np.ones(count))], 1)
+    prior = fitter([Lane(plan.start, free, np.zeros(count))], 1)[0]
+    total = sum(o.loss - prior.loss for o in single) + prior.loss
+    np.testing.assert_allclose(together.loss, total, rtol=1e-9)
+    np.testing.assert_allclose(
+        together.gradient, sum(o.gradient - prior.gradient for o in single) + prior.gradient, rtol=1e-8, atol=1e-9
+    )
 
 
 def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() -> None:

@@ -29,8 +29,6 @@ from simpel_cli.run import Manifest, make_directory, refuse_occupied
 from simulators.effects import Expression
 from simulators.model import Model
 
-SUBSTEPS = 2
-
 
 def discover(job: Job, *, strict: bool = False) -> None:
     """Run a search in its run directory.
@@ -80,7 +78,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         study.recording,
         tuple(study.measurements.noise_std),
         effects,
-        options.substeps or min(model.substeps, SUBSTEPS),
+        options.substeps,
     )
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from simpel_cli.discovery.filter import Track
+from simpel_cli.discovery.filter import Track, still
 from simpel_cli.discovery.setup import Setup
 from simpel_cli.discovery.windows import Windows
 
@@ -70,7 +70,7 @@ class Assessor:
     ) -> tuple[Track, Array, Array]:
         rule = self.plan.rule
         p, noise = self.plan.coordinates.bounded(bounds).physical(z)
-        track = rule.track(p, jnp.zeros(0, int), noise, y, ok, u, start, spread)
+        track = rule.track(still(p), noise, y, ok, u, start, spread)
         u_sub = rule.arriving(p, u)
         rows = y.shape[0]
 

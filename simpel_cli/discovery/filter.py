@@ -7,47 +7,49 @@ special. The process noise q makes the horizon adapt: a wrong model follows the 
 episodes. R is diagonal, so a row of measurements is taken in one scalar after the other (Bierman 1977): no inverse, and
 a missing one is left out.
 
+All arrays may have trailing axes for many windows and hypotheses at once: the innermost loops then run over contiguous
+numbers.
+
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004).
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import casadi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from simpel_cli.casadi_jax import checked, to_jax
 from simpel_cli.discovery.augmented import Augmented
+from simpel_cli.discovery.slopes import with_slope
 from simpel_cli.signals import arriving
 from simulators.effects.term import DELAY, LAG, SENSOR_DELAY
 
 
 class Noise(NamedTuple):
-    """Standard deviations of the measurements (ny,) and of the process, per square root of a second (nx,)."""
+    """Standard deviations of the measurements (ny, ...) and of the process, per square root of a second (nx, ...)."""
 
-    r: Float[Array, " ny"]
-    q: Float[Array, " nx"]
+    r: Float[Array, "ny ..."]
+    q: Float[Array, "nx ..."]
 
 
 class Track(NamedTuple):
     """What the filter leaves behind, one row per measured row."""
 
-    innovation: Float[Array, "T ny"]
-    variance: Float[Array, "T ny"]
-    predicted: Float[Array, "T nx"]
-    predicted_cov: Float[Array, "T nx nx"]
-    mean: Float[Array, "T nx"]
-    cov: Float[Array, "T nx nx"]
-    jacobian: Float[Array, "T nx nx"]  # of the transition to the next row
+    innovation: Float[Array, "T ny ..."]
+    variance: Float[Array, "T ny ..."]
+    predicted: Float[Array, "T nx ..."]
+    predicted_cov: Float[Array, "T nx nx ..."]
+    mean: Float[Array, "T nx ..."]
+    cov: Float[Array, "T nx nx ..."]
+    jacobian: Float[Array, "T nx nx ..."]  # of the transition to the next row
 
 
 class Filter(NamedTuple):
-    """The filter of one augmented model.
+    """The filter of one augmented model; every array may have further axes behind those named here.
 
     Args:
-        track: (p, rows of p that move, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`).
+        track: (moving, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`).
         flow: (p, x, u of the substeps) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         arriving: (p, u) -> inputs as they arrive, (T, substeps, nu).
@@ -59,64 +61,24 @@ class Filter(NamedTuple):
     arriving: Callable[..., Float[Array, "T substeps nu"]]
 
 
-class Active(NamedTuple):
-    """Parameters of a model, of which a few can move: only their derivatives are ever formed.
+class Moving(NamedTuple):
+    """Parameters of a model, of which at most one moves in the direction of a derivative.
 
     Args:
-        p: (dp,) all of them; derivatives in it are not followed.
-        rows: (width,) of p that move; a number beyond the last row is padding.
-        moving: (width,) their values; derivatives in it are followed.
+        p: (dp, ...) all of them. The model's own derivatives in it are not followed, those of delays and lags are.
+        row: (...) of p that moves; a number beyond the last row: none.
+        value: (...) its value: derivatives in it are followed.
     """
 
-    p: Float[Array, " dp"]
-    rows: Int[Array, " width"]
-    moving: Float[Array, " width"]
+    p: Float[Array, "dp ..."]
+    row: Int[Array, "..."]
+    value: Float[Array, "..."]
 
 
-def active(p: Float[Array, " dp"], index: Int[Array, " width"]) -> Active:
-    """Split parameters into values and moving part."""
-    return Active(jax.lax.stop_gradient(p), index, p.at[index].get(mode="fill", fill_value=0.0))
-
-
-def with_slope(augmented: Augmented, of: int) -> Callable[[Array, Array, Active], tuple[Array, Array]]:
-    """Return (x, u, active) -> one result of the model's function and its derivative in x.
-
-    Left to itself, XLA works out every sine anew for every direction of a derivative. Here CasADi differentiates twice,
-    the matrix of derivatives is made once per point, and a direction costs a product with its few columns.
-
-    Args:
-        augmented: model with candidates.
-        of: 0 for the rates, 1 for the sensors.
-    """
-    x, u, p = (augmented.function.sx_in(i) for i in range(3))
-    result = augmented.function(x, u, p)[of]
-    n, nx, nu = result.numel(), x.numel(), u.numel()
-    values = casadi.densify(casadi.vertcat(result, casadi.vec(casadi.jacobian(result, x).T)))
-    slopes = casadi.densify(casadi.jacobian(values, casadi.vertcat(x, u, p)))
-    names = ["x", "u", "p"]
-    model = augmented.model
-    ranges = [[(q.low, q.high) for q in group] for group in (model.states, model.inputs, augmented.params)]
-    value = checked(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]), ranges)
-    both = to_jax(casadi.Function("both", [x, u, p], casadi.cse([values, slopes]), names, ["v", "dv"]))
-
-    @jax.custom_jvp
-    def flat(x: Array, u: Array, p: Array, index: Array, moving: Array) -> Array:
-        return value(x, u, p)[0]
-
-    @flat.defjvp
-    def _(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-        x, u, p, index, _ = primals
-        tx, tu, _, _, moved = tangents
-        v, dv = both(x, u, p)
-        columns = dv[:, nx + nu :].at[:, index].get(mode="fill", fill_value=0.0)
-        out = dv[:, :nx] @ tx + columns @ moved
-        return v, out + dv[:, nx : nx + nu] @ tu if nu else out
-
-    def point(x: Array, u: Array, given: Active) -> tuple[Array, Array]:
-        v = flat(x, u, *given)
-        return v[:n], v[n:].reshape(n, nx)
-
-    return point
+def still(p: Float[Array, "dp ..."]) -> Moving:
+    """Parameters of which none moves."""
+    points = p.shape[1:]
+    return Moving(p, jnp.full(points, p.shape[0]), jnp.zeros(points, p.dtype))
 
 
 def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
@@ -136,58 +98,50 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     delays, lags, sensor_delays = (augmented.operators[kind] for kind in (DELAY, LAG, SENSOR_DELAY))
 
     def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
-        values = jnp.asarray(own or (0.0,) * size, p.dtype)
+        values = [jnp.full(p.shape[1:], own[i] if own else 0.0, p.dtype) for i in range(size)]
         for signal, row in rows:
-            values = values.at[signal].add(p[row])
-        return values
+            values[signal] = values[signal] + p[row]
+        return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
 
     def inputs(p: Array, u: Array) -> Array:
-        return arriving(
-            u,
-            per_signal(p, delays, nu, augmented.own_delay),
-            per_signal(p, lags, nu, augmented.own_lag),
-            dt=dt,
-            substeps=substeps,
-            lead=lead,
-        )
+        run = _over_points(lambda *a: arriving(*a, dt=dt, substeps=substeps, lead=lead), p.ndim - 1)
+        return run(u, per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag))
 
-    def flow(given: Active, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+    def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
 
         # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
         def stage(carry: Any, weights: Array) -> tuple[Any, None]:
             x, phi, u, total, total_phi, slope, slope_phi, _ = carry
-            slope, rate_x = rates(x + h * weights[0] * slope, u, given)
-            slope_phi = rate_x @ (phi + h * weights[0] * slope_phi)
+            slope, rate_x = apart(rates(x + h * weights[0] * slope, u, given))
+            slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
             after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
             return (x, phi, u, after, after_phi, slope, slope_phi, rate_x), None
 
         weights = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
-        nothing = jnp.zeros_like(x), jnp.zeros((nx, nx))
+        nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
+        unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
         def step(carry: Any, u: Array) -> tuple[Any, None]:
             x, phi, *_ = carry
             end = jax.lax.scan(stage, (x, phi, u, x, phi, *nothing, nothing[1]), weights)[0]
             return (end[3], end[4], end[5], end[7]), None
 
-        return jax.lax.scan(step, (x, jnp.eye(nx), *nothing), u)[0]
+        return jax.lax.scan(step, (x, unit, *nothing), u)[0]
 
-    def measure(given: Active, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
+    def measure(given: Moving, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
         """Return what the sensors read and its derivative in the state; a late one looks back along the rate."""
         y, slope = sensors(x, u, given)
         if not sensor_delays:
             return y, slope
-        p = given.p.at[given.rows].set(given.moving, mode="drop")
-        late = per_signal(p, sensor_delays, ny)[:, None]
-        back = -late * rate + 0.5 * late**2 * (rate_x @ rate)
-        return y + jnp.sum(slope * back, axis=1), slope - late * (slope @ rate_x)
+        late = per_signal(given.p, sensor_delays, ny)[:, None]
+        back = -late * rate[None] + 0.5 * late**2 * product(rate_x, rate[:, None])[None, :, 0]
+        return y + jnp.sum(slope * back, axis=1), slope - late * product(slope, rate_x)
 
-    def track(
-        p: Array, index: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array
-    ) -> Track:
-        given = active(p, index)
-        u_sub = inputs(p, u)
-        half = jnp.diag(noise.q**2) * (dt / 2)
+    def track(given: Moving, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> Track:
+        u_sub = inputs(given.p, u)
+        extra = start.ndim - 1
+        half = along(jnp.eye(nx), extra) * (noise.q**2 * (dt / 2))[None]
 
         def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, Track]:
             x, cov, u_before, rate, rate_x = carry
@@ -198,27 +152,50 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
             errors, variances = [], []
             for j in range(ny):
                 c = slope[j]
-                gain = cov @ c
-                s = c @ gain + noise.r[j] ** 2
+                gain = apart(product(cov, c[:, None])[:, 0])
+                s = jnp.sum(c * gain, axis=0) + noise.r[j] ** 2
                 e = y_k[j] - h_k[j]
-                e = (jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e) - c @ (x - predicted)
+                e = (jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e) - jnp.sum(c * (x - predicted), axis=0)
                 weight = ok_k[j] / s
                 errors.append(e)
                 variances.append(s)
-                x = x + gain * (weight * e)
-                cov = cov - weight * jnp.outer(gain, gain)
+                x = x + gain * (weight * e)[None]
+                cov = cov - weight[None, None] * (gain[:, None] * gain[None])
+                x, cov = apart((x, cov))
             following, jacobian, rate, rate_x = flow(given, x, u_k)
-            after = jacobian @ (cov + half) @ jacobian.T + half
+            after = product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
             out = Track(jnp.stack(errors), jnp.stack(variances), predicted, predicted_cov, x, cov, jacobian)
             return (following, after, u_k[-1], rate, rate_x), out
 
-        begin = (start, jnp.diag(spread**2), u_sub[0, 0], jnp.zeros(nx), jnp.zeros((nx, nx)))
+        nothing = jnp.zeros_like(start), jnp.zeros((nx, *start.shape), start.dtype)
+        begin = (start, along(jnp.eye(nx), extra) * (spread**2)[None], u_sub[0, 0], *nothing)
         return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
 
     def plain_flow(p: Array, x: Array, u: Array) -> Array:
-        return flow(active(p, jnp.zeros(0, int)), x, u)[0]
+        return flow(still(p), x, u)[0]
 
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
-        return sensors(x, u, active(p, jnp.zeros(0, int)))[0]
+        return sensors(x, u, still(p))[0]
 
     return Filter(track, plain_flow, plain_measure, inputs)
+
+
+def product(a: Float[Array, "n k ..."], b: Float[Array, "k m ..."]) -> Float[Array, "n m ..."]:
+    """Product of small matrices at every point: sums that XLA fuses, where it would call a matrix routine per point."""
+    return sum((a[:, j, None] * b[None, j] for j in range(1, a.shape[1])), a[:, 0, None] * b[None, 0])
+
+
+def apart(values: Any) -> Any:
+    """Keep XLA from working values out again in every place that uses them."""
+    return jax.lax.optimization_barrier(values)
+
+
+def along(a: Array, extra: int) -> Array:
+    """Append axes of length one, so that an array is the same at all points."""
+    return a.reshape(*a.shape, *(1,) * extra)
+
+
+def _over_points(function: Callable[..., Array], extra: int) -> Callable[..., Array]:
+    for _ in range(extra):
+        function = jax.vmap(function, in_axes=-1, out_axes=-1)
+    return function

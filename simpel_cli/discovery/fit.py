@@ -9,7 +9,9 @@ do not see earns nothing. An unknown at its bound loses log 2: half of its mass 
 Reference: Levenberg (1944), Marquardt (1963); Kass and Raftery (1995), Bayes factors, eq. 5.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,14 +21,15 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.discovery.coordinates import Coordinates
-from simpel_cli.discovery.filter import Filter
+from simpel_cli.discovery.filter import Filter, Moving, Noise
 from simpel_cli.discovery.windows import Windows
 
 LEAST_CURVATURE = 12.0
 AT_BOUND = 1e-4
-ENOUGH = 5e-3  # nats: a step that promises less ends a fit
+ENOUGH = 0.02  # nats: a step that promises less ends a fit
 MOST_REJECTED = 6  # steps in a row
-MOST = 60  # iterations
+MOST = 40  # iterations
+ROUND = 4  # iterations after which fits that have arrived make room for others
 FIRST_DAMPING = 1e-2
 
 
@@ -64,26 +67,57 @@ class Optimum(NamedTuple):
     converged: bool
 
 
+class Course(NamedTuple):
+    """Where the fits of a batch of lanes stand; NumPy outside the program, JAX inside; leading axis: lanes."""
+
+    z: Any  # (L, n) where they started
+    index: Any  # (L, width) of z that move
+    moves: Any  # (L, width) False: padding
+    weight: Any  # (L, W)
+    trial: Any  # (L, width) the next point to try
+    part: Any  # (L, width) the best so far
+    loss: Any
+    gradient: Any
+    fisher: Any
+    damping: Any
+    iteration: Any
+    done: Any
+    rejected: Any
+
+
 class Fitter:
-    """Fits hypotheses; one compiled program for a batch of `lanes`, with up to `width` free unknowns each."""
+    """Fits hypotheses; one compiled program for a batch of `lanes`, with up to `width` free unknowns each.
+
+    Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
+    those that wait, always in the same order: a result does not depend on the number of threads.
+    """
 
     def __init__(
-        self, rule: Filter, coordinates: Coordinates, windows: Windows, *, lanes: int = 8, width: int = 16
+        self, rule: Filter, coordinates: Coordinates, windows: Windows, *, lanes: int = 4, width: int = 16
     ) -> None:
         self.coordinates, self.windows, self.lanes, self.width = coordinates, windows, lanes, width
-        self._data = windows.arrays
-        self._program = jax.jit(jax.vmap(partial(_fit, rule, coordinates), in_axes=(None, None, 0, 0, 0, 0, None)))
+        self._data = tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
+        self._program = jax.jit(partial(_advance, rule, coordinates))
+        self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
+        self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
     def __call__(self, hypotheses: Sequence[Lane], most: int = MOST) -> list[Optimum]:
-        """Fit every hypothesis, `lanes` at a time, with `most` iterations."""
-        found: list[Optimum] = []
-        for begin in range(0, len(hypotheses), self.lanes):
-            chunk = list(hypotheses[begin : begin + self.lanes])
-            padded = chunk + [chunk[0]] * (self.lanes - len(chunk))
-            found += self._run(padded, most)[: len(chunk)]
-        return found
+        """Fit every hypothesis with `most` iterations."""
+        if not hypotheses:
+            return []
+        state = self._begin(hypotheses)
+        waiting = np.arange(len(hypotheses))
+        while waiting.size:
+            chunks = [waiting[i : i + self.lanes] for i in range(0, len(waiting), self.lanes)]
+            # the first call compiles: not twice side by side
+            threads = self._threads.map if self._program._cache_size() else map  # type: ignore[attr-defined]
+            for chunk, ended in zip(chunks, threads(partial(self._advanced, state, most), chunks), strict=True):
+                for old, new in zip(state, ended, strict=True):
+                    old[chunk] = new[: len(chunk)]
+            waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
+        return [self._optimum(state, i, lane.free) for i, lane in enumerate(hypotheses)]
 
-    def _run(self, lanes: list[Lane], most: int) -> list[Optimum]:
+    def _begin(self, lanes: Sequence[Lane]) -> Course:
         padding = len(self.coordinates.low) - 1
         index = np.full((len(lanes), self.width), padding)
         for i, lane in enumerate(lanes):
@@ -91,21 +125,28 @@ class Fitter:
                 raise ValueError(f"{len(lane.free)} free unknowns, {self.width} at most")
             index[i, : len(lane.free)] = lane.free
         z = np.stack([lane.z for lane in lanes])
-        weight = np.stack([lane.weight for lane in lanes])
-        result = self._program(
-            tuple(jnp.asarray(a) for a in self.coordinates.bounds),
-            jnp.asarray(most),
-            jnp.asarray(z),
-            jnp.asarray(index),
-            jnp.asarray(index != padding),
-            jnp.asarray(weight),
-            self._data,
-        )
-        z, loss, gradient, fisher, iterations, converged = (np.asarray(a) for a in result)
-        return [
-            _optimum(z[i], lane.free, loss[i], gradient[i], fisher[i], int(iterations[i]), bool(converged[i]))
-            for i, lane in enumerate(lanes)
-        ]
+        part = np.take_along_axis(z, index, axis=1)
+        count, width = index.shape
+        return Course(
+            z, index, index != padding, np.stack([lane.weight for lane in lanes]), part.copy(), part,
+            np.full(count, np.inf), np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1)),
+            np.full(count, FIRST_DAMPING), np.zeros(count, int), np.zeros(count, bool), np.zeros(count, int),
+        )  # fmt: skip
+
+    def _advanced(self, state: Course, most: int, chunk: np.ndarray) -> list[np.ndarray]:
+        filled = np.concatenate([chunk, np.repeat(chunk[:1], self.lanes - len(chunk))])
+        lanes = Course(*(jnp.asarray(a[filled]) for a in state))
+        with jax.enable_x64(True):
+            ended = self._program(self._bounds, jnp.asarray(min(most, ROUND)), lanes, self._data)
+        return [np.asarray(a) for a in ended]
+
+    def _optimum(self, state: Course, i: int, free: tuple[int, ...]) -> Optimum:
+        z = state.z[i].copy()
+        d = len(free)
+        z[list(free)] = state.part[i, :d]
+        return _optimum(
+            z, free, float(state.loss[i]), state.gradient[i], state.fisher[i], int(state.iteration[i]), bool(state.done[i])
+        )  # fmt: skip
 
 
 def _optimum(
@@ -130,91 +171,113 @@ def _optimum(
     return Optimum(z, free, float(loss), float(evidence), gradient, fisher, covariance, iterations, converged)
 
 
-def _fit(
-    rule: Filter,
-    coordinates: Coordinates,
-    bounds: tuple[Array, ...],
-    most: Array,
-    z: Array,
-    index: Array,
-    moves: Array,
-    weight: Array,
-    data: Any,
-) -> tuple[Array, ...]:
-    """Levenberg-Marquardt on Fisher information, inside the unit box."""
-    coordinates = coordinates.bounded(bounds)
-    sd = coordinates.sd_of_prior()[index]
-    normal = jnp.isfinite(sd) & moves
-    inverse_variance = jnp.where(normal, 1 / sd**2, 0.0)
-    log_norm = jnp.sum(jnp.where(normal, jnp.log(jnp.where(normal, sd, 1.0)) + 0.5 * np.log(2 * np.pi), 0.0))
+Evaluate = Callable[[Array], tuple[Array, Array, Array]]
 
-    def innovations(part: Array, *window: Array) -> tuple[Array, Array]:
-        p, noise = coordinates.physical(z.at[index].set(jnp.where(moves, part, z[index])))
-        rows = jnp.where(index < p.shape[0], index, z.shape[0])  # a noise is no parameter of the model
-        track = rule.track(p, rows, noise, *window)
+
+def _advance(
+    rule: Filter, coordinates: Coordinates, bounds: tuple[Array, ...], most: Array, lanes: Course, data: Any
+) -> Course:
+    """Levenberg-Marquardt on Fisher information, inside the unit box: `most` iterations of every lane."""
+    coordinates = coordinates.bounded(bounds)
+    evaluate = partial(_evaluate, rule, coordinates, lanes, data)
+
+    def body(carry: tuple[Course, Array]) -> tuple[Course, Array]:
+        now, count = carry
+        found = evaluate(now.trial)
+        return jax.vmap(_stepped)(now, *found), count + 1
+
+    def going(carry: tuple[Course, Array]) -> Array:
+        return (carry[1] < most) & ~jnp.all(carry[0].done)
+
+    return jax.lax.while_loop(going, body, (lanes, jnp.asarray(0)))[0]
+
+
+def _evaluate(
+    rule: Filter, coordinates: Coordinates, lanes: Course, data: Any, part: Array
+) -> tuple[Array, Array, Array]:
+    """Negative log posterior (L,), its gradient (L, width) and Fisher information (L, width, width)."""
+    count = part.shape[0]
+    y, ok, u, start, spread = data
+    windows = start.shape[-1]
+    # lanes times windows are the points of the filter, all windows of a lane side by side
+    tiled = [jnp.tile(a, (1,) * (a.ndim - 1) + (count,)) for a in (y, ok, u, start, spread)]
+    z = jax.vmap(lambda z, i, v, m: z.at[i].set(jnp.where(m, v, z[i])))(lanes.z, lanes.index, part, lanes.moves)
+
+    def innovations(z: Array, row: Array) -> tuple[Array, Array]:
+        p, noise = jax.vmap(coordinates.physical, out_axes=-1)(z)
+        value = jnp.take_along_axis(p, jnp.minimum(row, p.shape[0] - 1)[None], axis=0)[0]
+        each = partial(jnp.repeat, repeats=windows, axis=-1)
+        track = rule.track(Moving(each(p), each(row), each(value)), Noise(*map(each, noise)), *tiled)
         return track.innovation, track.variance
 
-    def evaluate(part: Array) -> tuple[Array, Array, Array]:
-        def window(y: Array, ok: Array, *rest: Array) -> tuple[Array, Array, Array]:
-            def both(v: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-                out = innovations(v, y, ok, *rest)
-                return out, out
+    def along_one(index: Array) -> Any:
+        direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(index)
+        rows = coordinates.sizes[0]
+        row = jnp.where(index < rows, index, rows)  # a noise is no parameter of the model
+        return jax.jvp(lambda z: innovations(z, row), (z,), (direction,))
 
-            (de, ds), (e, s) = jax.jacfwd(both, has_aux=True)(part)
-            e, s, ok_ = e.ravel(), s.ravel(), ok.ravel()
-            de, ds = de.reshape(e.size, -1), ds.reshape(e.size, -1)
-            s = jnp.where(ok_ > 0, s, 1.0)
-            e = jnp.where(ok_ > 0, e, 0.0)
-            de, ds = (jnp.where(ok_[:, None] > 0, a, 0.0) for a in (de, ds))
-            loss = 0.5 * jnp.sum(ok_ * (jnp.log(s) + e * e / s))
-            gradient = (e / s) @ de + 0.5 * ((1 / s - (e / s) ** 2) @ ds)
-            fisher = (de / s[:, None]).T @ de + 0.5 * (ds / s[:, None] ** 2).T @ ds
-            return loss, gradient, fisher
+    (e, s), (de, ds) = jax.vmap(along_one, in_axes=1, out_axes=((None, None), 0))(lanes.index)
+    ok = tiled[1] > 0
+    s = jnp.where(ok, s, 1.0)
+    e = jnp.where(ok, e, 0.0)
+    de, ds = (jnp.where(ok[None], a, 0.0) for a in (de, ds))
+    weight = lanes.weight.reshape(-1)
 
-        losses, gradients, fishers = jax.vmap(window)(*data)
-        away = part - 0.5
-        loss = weight @ losses + 0.5 * jnp.sum(inverse_variance * away**2) + log_norm
-        gradient = jnp.where(moves, weight @ gradients + inverse_variance * away, 0.0)
-        both_move = moves[:, None] & moves[None, :]
-        fisher = jnp.where(both_move, jnp.einsum("w,wij->ij", weight, fishers), 0.0) + jnp.diag(inverse_variance)
-        finite = jnp.isfinite(loss) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(fisher))
-        return jnp.where(finite, loss, jnp.inf), gradient, fisher
+    def per_lane(a: Array) -> Array:
+        """(..., T, ny, L W) -> (L, ..., T ny W)."""
+        lead = a.shape[:-3]
+        apart = a.reshape(*lead, -1, count, windows)
+        return jnp.moveaxis(apart, -2, 0).reshape(count, *lead, -1)
 
-    def propose(part: Array, gradient: Array, fisher: Array, damping: Array) -> tuple[Array, Array]:
-        """Return the next trial and the gain that the quadratic model promises."""
-        out = ((part <= 0) & (gradient > 0)) | ((part >= 1) & (gradient < 0)) | ~moves
-        free = ~out
-        matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
-        scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
-        matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
-        step = -jnp.linalg.solve(matrix, jnp.where(free, gradient, 0.0))
-        longest = jnp.max(jnp.abs(step))
-        step = step * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
-        following = jnp.clip(part + step, 0.0, 1.0)
-        step = following - part
-        return following, -(gradient @ step) - 0.5 * step @ fisher @ step
+    loss = jnp.sum(per_lane(jnp.where(ok, 0.5 * weight[None, None] * (jnp.log(s) + e * e / s), 0.0)), axis=1)
+    first = per_lane(weight[None, None] * (e / s))
+    second = per_lane(0.5 * weight[None, None] * (1 / s - (e / s) ** 2))
+    slopes, spreads = per_lane(de), per_lane(ds)
+    gradient = jnp.einsum("ldk,lk->ld", slopes, first) + jnp.einsum("ldk,lk->ld", spreads, second)
+    root = per_lane(jnp.sqrt(weight[None, None] / s))[:, None]
+    scaled = jnp.concatenate([slopes * root, spreads * root * per_lane(jnp.sqrt(0.5 / s))[:, None]], axis=2)
+    fisher = jnp.einsum("ldk,lek->lde", scaled, scaled)
 
-    def body(carry: tuple) -> tuple:
-        trial, part, loss, gradient, fisher, damping, iteration, _, rejected = carry
-        new_loss, new_gradient, new_fisher = evaluate(trial)
-        better = new_loss < loss
-        keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
-        part, loss = keep(trial, part), keep(new_loss, loss)
-        gradient, fisher = keep(new_gradient, gradient), keep(new_fisher, fisher)
-        damping = jnp.where(better, jnp.maximum(damping / 5, 1e-6), jnp.minimum(damping * 8, 1e8))
-        rejected = jnp.where(better, 0, rejected + 1)
-        following, promised = propose(part, gradient, fisher, damping)
-        done = (promised < ENOUGH) | (rejected >= MOST_REJECTED)
-        return following, part, loss, gradient, fisher, damping, iteration + 1, done, rejected
+    sd = coordinates.sd_of_prior()[lanes.index]
+    normal = jnp.isfinite(sd) & lanes.moves
+    inverse_variance = jnp.where(normal, 1 / sd**2, 0.0)
+    log_norm = jnp.sum(jnp.where(normal, jnp.log(jnp.where(normal, sd, 1.0)) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
+    away = part - 0.5
+    loss = loss + 0.5 * jnp.sum(inverse_variance * away**2, axis=1) + log_norm
+    gradient = jnp.where(lanes.moves, gradient + inverse_variance * away, 0.0)
+    both_move = lanes.moves[:, :, None] & lanes.moves[:, None, :]
+    fisher = jnp.where(both_move, fisher, 0.0) + jax.vmap(jnp.diag)(inverse_variance)
+    finite = jnp.isfinite(loss) & jnp.isfinite(gradient).all(axis=1) & jnp.isfinite(fisher).all(axis=(1, 2))
+    return jnp.where(finite, loss, jnp.inf), gradient, fisher
 
-    def going(carry: tuple) -> Array:
-        return (carry[6] < most) & ~carry[7]
 
-    # the first pass takes the start for a trial, so that the filter is compiled once
-    part, width = z[index], index.shape[0]
-    begin = (
-        part, part, jnp.asarray(jnp.inf), jnp.zeros(width), jnp.eye(width), jnp.asarray(FIRST_DAMPING),
-        jnp.asarray(0), jnp.asarray(False), jnp.asarray(0),
+def _stepped(now: Course, new_loss: Array, new_gradient: Array, new_fisher: Array) -> Course:
+    """One lane after its trial was evaluated: taken or not, and the next trial."""
+    better = new_loss < now.loss
+    keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
+    part, loss = keep(now.trial, now.part), keep(new_loss, now.loss)
+    gradient, fisher = keep(new_gradient, now.gradient), keep(new_fisher, now.fisher)
+    damping = jnp.where(better, jnp.maximum(now.damping / 5, 1e-6), jnp.minimum(now.damping * 8, 1e8))
+    rejected = jnp.where(better, 0, now.rejected + 1)
+    following, promised = _proposed(part, gradient, fisher, damping, now.moves)
+    done = (promised < ENOUGH) | (rejected >= MOST_REJECTED)
+    after = now._replace(
+        trial=following, part=part, loss=loss, gradient=gradient, fisher=fisher, damping=damping,
+        iteration=now.iteration + 1, done=done, rejected=rejected,
     )  # fmt: skip
-    _, part, loss, gradient, fisher, _, iteration, done, _ = jax.lax.while_loop(going, body, begin)
-    return z.at[index].set(jnp.where(moves, part, z[index])), loss, gradient, fisher, iteration, done
+    return jax.tree.map(lambda old, new: jnp.where(now.done, old, new), now, after)
+
+
+def _proposed(part: Array, gradient: Array, fisher: Array, damping: Array, moves: Array) -> tuple[Array, Array]:
+    """Return the next trial and the gain that the quadratic model promises."""
+    out = ((part <= 0) & (gradient > 0)) | ((part >= 1) & (gradient < 0)) | ~moves
+    free = ~out
+    matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
+    scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
+    matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
+    step = -jnp.linalg.solve(matrix, jnp.where(free, gradient, 0.0))
+    longest = jnp.max(jnp.abs(step))
+    step = step * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
+    following = jnp.clip(part + step, 0.0, 1.0)
+    step = following - part
+    return following, -(gradient @ step) - 0.5 * step @ fisher @ step

@@ -16,8 +16,9 @@ from simulators.effects import Term
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 TIE = 3.0  # nats within which two names are not told apart
-PROMISING = 0.5  # nats that the score must promise for a candidate to be fitted
-KEPT = 8  # candidates of a stage that are fitted in any case
+PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
+SHARE = 0.2  # of the largest promise, likewise
+KEPT = 6  # starts of a stage that are fitted in any case
 MOST_EFFECTS = 5
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 STARTS = 6  # of the model as it is
@@ -120,7 +121,9 @@ class Search:
         starts = [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
         promised = promises(self, before, starts)
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
-        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > PROMISING]
+        finite = promised[np.isfinite(promised)]
+        least = max(PROMISING, SHARE * float(finite.max(initial=0.0)))
+        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > least]
         found = self.fitter([starts[i][1] for i in going])
         best: dict[int, Optimum] = {}
         for i, optimum in zip(going, found, strict=True):

@@ -11,14 +11,14 @@ class Discovery:
 
     Args:
         horizon: how far ahead errors are judged, in rows.
-        substeps: Runge-Kutta steps per row in the filter; null = the simulator's own, 2 at most.
+        substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 2 at most.
         lanes: fits that run side by side in the compiled program.
         room: unknowns of effects that a hypothesis can have at once.
     """
 
     horizon: int = 20
     substeps: int | None = None
-    lanes: int = 8
+    lanes: int = 4
     room: int = 9
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from simpel_cli.discovery import windows as windows_
 from simpel_cli.discovery.augmented import Augmented, augment
 from simpel_cli.discovery.coordinates import Coordinates, coordinates_of
 from simpel_cli.discovery.filter import Filter, filter_of
+from simpel_cli.discovery.steps import substeps_needed
 from simpel_cli.discovery.windows import Windows, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
@@ -18,7 +19,6 @@ from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
-STEP_TOLERANCE = 0.02  # of the measurement noise: what the integrator may err in one row
 FOLDS = 5
 
 
@@ -36,7 +36,11 @@ class Setup(NamedTuple):
 
 
 def setup(
-    model: Model, recording: Recording, declared_noise: Sequence[str], effects: Sequence[Expression], substeps: int
+    model: Model,
+    recording: Recording,
+    declared_noise: Sequence[str],
+    effects: Sequence[Expression],
+    substeps: int | None = None,
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -45,7 +49,7 @@ def setup(
         recording: its measurements.
         declared_noise: names of the channels whose noise the user declared.
         effects: the catalogue, or what of it is to be tried.
-        substeps: Runge-Kutta steps per row.
+        substeps: Runge-Kutta steps per row; None: as many as the noise asks for.
 
     Raises:
         DataError: too few rows.
@@ -75,8 +79,11 @@ def setup(
         recording.train, [q.name for q in model.states], measured, recording.outputs, middle, spread, lead=lead,
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
+    noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
+    r = np.array(list(noise_std.values()))
+    if substeps is None:
+        substeps = substeps_needed(model, recording.train, noise_std, scales, augmented.neutral[: len(model.params)])
     rule = filter_of(augmented, substeps=substeps, lead=lead)
-    r = np.array([max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured])
     driven = [q.name for q in model.states if q.name in augmented.roles.dynamic]
     typical = np.array([scales.rate[name] * np.sqrt(model.dt) for name in driven])
     coordinates = coordinates_of(

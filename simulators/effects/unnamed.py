@@ -7,6 +7,8 @@ Reference: Solin and Sarkka (2020), Hilbert space methods for reduced-rank Gauss
 
 import math
 
+from numpy.polynomial import chebyshev, polynomial
+
 from simulators.effects.expression import Scales, per
 from simulators.effects.structure import structure
 from simulators.effects.term import RATE, Knob, Term
@@ -53,7 +55,7 @@ def _sines(argument: str, size: float) -> tuple[list[str], list[float]]:
     waves, shares = [], []
     for j in range(1, BASES + 1):
         frequency = math.pi * j / (2 * box)
-        waves.append(f"sin({frequency:.6g}*({argument} + {box:.6g}))")
+        waves.append(_multiple("sin", j, f"({math.pi / (2 * box):.6g}*({argument} + {box:.6g}))"))
         density = math.sqrt(2 * math.pi) * length * math.exp(-((frequency * length) ** 2) / 2)
         shares.append(math.sqrt(density / box))
     return waves, shares
@@ -61,5 +63,24 @@ def _sines(argument: str, size: float) -> tuple[list[str], list[float]]:
 
 def _harmonics(angle: str) -> tuple[list[str], list[float]]:
     """Sines and cosines of an angle: a periodic GP."""
-    waves = [f"{f}({j}*{angle})" for j in range(1, BASES // 2 + 1) for f in ("sin", "cos")]
+    waves = [_multiple(f, j, angle) for j in range(1, BASES // 2 + 1) for f in ("sin", "cos")]
     return waves, [1 / j for j in range(1, BASES // 2 + 1) for _ in range(2)]
+
+
+def _multiple(wave: str, j: int, angle: str) -> str:
+    """Write sin(j angle) or cos(j angle) with the sine and cosine of the angle alone, which all j then share.
+
+    sin(j a) = sin(a) U_{j-1}(cos a),    cos(j a) = T_j(cos a)     (Chebyshev's polynomials of both kinds)
+    """
+    powers = chebyshev.cheb2poly([0.0] * j + [1.0])
+    if wave == "sin":
+        powers = polynomial.polyder(powers) / j
+    degree = len(powers) - 1
+    cosine = f"cos({angle})"
+    square = f"({cosine}*{cosine})"
+    text = f"{powers[degree]:.0f}"
+    for k in range(degree - 2, -1, -2):
+        text = f"({powers[k]:.0f} + {square}*{text})"
+    if degree % 2:
+        text = f"{cosine}*{text}"
+    return text if wave == "cos" else f"sin({angle})*{text}"

@@ -1,0 +1,72 @@
+"""How many Runge-Kutta steps a row needs, so that the integrator errs less than the sensors do."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode
+from simulators.effects import Scales, structure
+from simulators.model import Model
+
+TOLERANCE = 0.05  # of the measurement noise, in one row of a smooth model
+MOST = 2  # a friction that changes sign within a row would ask for ever more
+ROWS = 300  # looked at
+SWITCH = 0.1  # a force that changes sign within a row, in typical rates: a step misses up to a sixth of twice it
+
+
+def substeps_needed(
+    model: Model, episodes: Sequence[Episode], noise_std: dict[str, float], scales: Scales, at: np.ndarray
+) -> int:
+    """Return the least number of steps per row at which neither the model nor a switching force is integrated too coarsely.
+
+    Args:
+        model: the simulator.
+        episodes: its measurements; what is not measured lies in the middle of its range.
+        noise_std: measured name -> standard deviation.
+        scales: magnitudes in the measurements.
+        at: (dp,) parameters.
+    """
+    states = np.concatenate([e.states for e in episodes])
+    middle = np.array([(q.low + q.high) / 2 for q in model.states])
+    kept = np.unique(np.linspace(0, len(states) - 1, min(ROWS, len(states))).astype(int))
+    x = np.where(np.isfinite(states), states, middle)[kept].T
+    u = np.nan_to_num(np.concatenate([e.inputs for e in episodes])[kept].T)
+    function = model.function()
+    p = np.tile(np.asarray(at, float)[:, None], len(kept))
+
+    def rate(x: np.ndarray) -> np.ndarray:
+        return np.asarray(function(x, u, p)[0])
+
+    names = [q.name for q in model.states]
+    finest = _moved(rate, x, model.dt, 8 * MOST)
+    for steps in range(1, MOST):
+        missed = np.abs(_moved(rate, x, model.dt, steps) - finest)
+        smooth = all(
+            np.nanquantile(missed[names.index(name)], 0.99) < TOLERANCE * std
+            for name, std in noise_std.items()
+            if name in names
+        )
+        if smooth and steps >= _of_switches(model, noise_std, scales):
+            return steps
+    return MOST
+
+
+def _of_switches(model: Model, noise_std: dict[str, float], scales: Scales) -> float:
+    """Return how many steps keep what a dry friction misses at a reversal below the noise of the speed."""
+    needed = 0.0
+    for velocity, position in structure(model).velocity.items():
+        known = noise_std.get(velocity) or (noise_std.get(position or "", 0.0) / model.dt)
+        if known > 0:
+            needed = max(needed, SWITCH * scales.rate[velocity] * model.dt / known)
+    return needed
+
+
+def _moved(rate: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float, steps: int) -> np.ndarray:
+    h = dt / steps
+    for _ in range(steps):
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x
