@@ -43,6 +43,7 @@ class Track(NamedTuple):
     mean: Float[Array, "T nx ..."]
     cov: Float[Array, "T nx nx ..."]
     jacobian: Float[Array, "T nx nx ..."]  # of the transition to the next row
+    slope: Float[Array, "T ny nx ..."]  # of what the sensors read, in the predicted state
 
 
 class Filter(NamedTuple):
@@ -164,7 +165,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
                 x, cov = apart((x, cov))
             following, jacobian, rate, rate_x = flow(given, x, u_k)
             after = product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
-            out = Track(jnp.stack(errors), jnp.stack(variances), predicted, predicted_cov, x, cov, jacobian)
+            out = Track(jnp.stack(errors), jnp.stack(variances), predicted, predicted_cov, x, cov, jacobian, slope)
             return (following, after, u_k[-1], rate, rate_x), out
 
         nothing = jnp.zeros_like(start), jnp.zeros((nx, *start.shape), start.dtype)
