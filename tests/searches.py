@@ -35,6 +35,15 @@ REMAINDER = {
     "acts_on": "omega", "depends_on": ["omega", "u"], "rms": 0.31, "unit": "rad/s^2", "log_evidence_gain": 44.0,
     "description": "something acts on d(omega)/dt",
 }  # fmt: skip
+NEXT: dict[str, Any] = {
+    "file": "next_experiment.csv", "start": {"omega": 0.0}, "kind": "ramps", "seconds": 3.0,
+    "units": {"omega": "rad/s", "u": "V"}, "expected_log_likelihood_ratio": 13.7,
+    "pairs": [
+        {"true": "coulomb_friction", "against": "viscous_friction", "expected_log_likelihood_ratio": 13.7},
+        {"true": "viscous_friction", "against": "coulomb_friction", "expected_log_likelihood_ratio": 15.2},
+    ],
+    "description": "Run the 3 s ramps of next_experiment.csv from omega = 0 rad/s: expected 14 nats.",
+}  # fmt: skip
 
 
 def verdict(kind: str) -> dict[str, Any]:
@@ -65,8 +74,7 @@ def verdict(kind: str) -> dict[str, Any]:
              "log_evidence_gain": -96595.0},
         ],
         "data_checks": [{"check": "stale", "ok": False, "detail": "omega repeats itself in rows 3 to 5"}],
-        "next_experiment": {"summary": "One more 6 s run tells them apart.", "file": "next_experiment.csv",
-                            "probability": 0.97} if kind == "ambiguous" else None,
+        "next_experiment": NEXT if kind == "ambiguous" else None,
         "corrected_sim": "conf/sim/rotor_with_coulomb_friction.yaml" if effects else None,
         "corrected_sim_lacks": [],
         "candidates_tried": 21,
@@ -87,7 +95,16 @@ def directory(folder: Path, kind: str) -> Path:
     curves(folder, both)
     runs(folder, both)
     tables(folder, both)
+    if found["next_experiment"]:
+        following(folder)
     return folder
+
+
+def following(folder: Path) -> None:
+    t = np.arange(60) * 0.05
+    rows = [f"{a},{np.sin(a)},{np.sin(a - 0.5)},{np.sin(a - 0.4)}\n" for a in t]
+    head = "time,u,omega_if_coulomb_friction,omega_if_viscous_friction\n"
+    (folder / "next_experiment.csv").write_text(f"# {NEXT['description']}\n{head}{''.join(rows)}")
 
 
 def residuals(folder: Path, both: bool) -> None:

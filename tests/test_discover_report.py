@@ -13,7 +13,7 @@ import searches
 from simpel_cli.commands.discover_report import equation_section, marked, next_section, prior_section, untested
 from simpel_cli.commands.discover_show import next_commands, publish
 from simpel_cli.console import Terminal
-from simpel_cli.plots import discover_evidence, discover_force, discover_runs, draw_discover
+from simpel_cli.plots import discover_evidence, discover_force, discover_next, discover_runs, draw_discover
 from simpel_cli.plots.canvas import columns_of, units_of, with_interval
 from simpel_cli.records import write_table
 
@@ -56,6 +56,7 @@ def test_report(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -
     assert str(path) in printed
     assert ("10.0x (9.0..11.0)" in printed) == bool(found["effects"])
     assert "omega outside -2..2.5 rad/s" in printed
+    assert (searches.NEXT["description"] in printed) == (kind == "ambiguous")
 
 
 def test_a_hopeless_fit_has_no_size(tmp_path: Path) -> None:
@@ -91,11 +92,18 @@ def test_a_late_input_is_part_of_the_equation() -> None:
     assert known[1]["lines"][-1] == [("u acts as u(t - d)", False)]
 
 
-def test_next_experiment_of_any_form() -> None:
+def test_next_experiment(tmp_path: Path) -> None:
     assert next_section({"next_experiment": None}) == {}
-    assert next_section({"next_experiment": "Swing it."})["note"] == "Swing it."
-    section = next_section({"next_experiment": {"summary": "Swing it.", "probability": 0.97, "tells": ["a", "b"]}})
-    assert section["rows"] == [["probability", "0.97"], ["tells", "a, b"]]
+    section = next_section({"next_experiment": searches.NEXT})
+    assert section["note"] == searches.NEXT["description"]
+    assert section["rows"][0] == ["coulomb friction", "viscous friction", "13.7 nat"]
+    nothing = searches.NEXT | {"file": None, "pairs": [], "description": "None was found."}
+    assert next_section({"next_experiment": nothing})["note"] == "None was found."
+    path = searches.directory(tmp_path, "ambiguous") / "next_experiment.csv"
+    top, below = discover_next.draw_next(searches.verdict("ambiguous"), path).axes
+    assert top.get_ylabel() == "u [V]"
+    assert [line.get_label() for line in below.lines] == ["if coulomb friction", "if viscous friction"]
+    np.testing.assert_allclose(below.lines[1].get_ydata()[:2], np.sin([-0.4, -0.35]))
 
 
 def test_commands_fit_the_verdict() -> None:
@@ -142,6 +150,7 @@ def test_units_of_columns_come_back(tmp_path: Path) -> None:
 def test_figures(tmp_path: Path, kind: str) -> None:
     names = [path.stem for path in draw_discover(searches.directory(tmp_path, kind))]
     wanted = ["residual", "effects", "traces", "evidence", "parameters", "whiteness", "errors"]
+    wanted += ["next_experiment"] if kind == "ambiguous" else []
     assert names == (wanted if kind in ("effect", "ambiguous") else [n for n in wanted if n != "effects"])
 
 

@@ -1,5 +1,6 @@
 """The next experiment: its figure against closed forms, and what it chooses on a pendulum with weak data."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from simpel_cli.discovery.episodes import DRIVEN, FREE, Proposal, signal
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.next_experiment import FILE, Class, Designer, class_of, next_experiment
 from simpel_cli.discovery.selection import Search, Selection, Stage
-from simpel_cli.discovery.setup import setup
+from simpel_cli.discovery.setup import Setup, setup
 from simulators.effects import Expression
 from simulators.model import Declared, Quantity
 
@@ -49,10 +50,17 @@ def expected(true: Any, judge: Any) -> float:
     return -0.5 * (np.linalg.slogdet(judge[1])[1] + np.trace(inside))
 
 
-@pytest.mark.parametrize("sd", [0.0, 0.15])
-def test_the_figure_is_the_divergence_of_two_gaussians(sd: float) -> None:
-    """Two lanes that differ in load, damping and both noises; parameters known, and load and gain known to within sd."""
+@pytest.fixture(scope="module")
+def lane() -> tuple[Setup, Any]:
+    """The lane, and its compiled forecast."""
     plan = setup(model(), recording(), (), [LOAD], 2)
+    return plan, jax.jit(partial(forecast, plan.rule, rows=ROWS, dt=DT))
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.15])
+def test_the_figure_is_the_divergence_of_two_gaussians(lane: tuple[Setup, Any], sd: float) -> None:
+    """Two lanes that differ in load, damping and both noises; parameters known, and load and gain known to within sd."""
+    plan, program = lane
     names = [q.name for q in plan.augmented.params]
     truth = [(A, B, 0.0, np.array([0.05, 0.07]), 0.3), (0.5, 1.1, 0.4, np.array([0.06, 0.07]), 0.2)]
     points, laws = [], []
@@ -69,12 +77,11 @@ def test_the_figure_is_the_divergence_of_two_gaussians(sd: float) -> None:
         laws.append((known, (known[0], known[1] + sum(np.outer(m - known[0], m - known[0]) for m in moved))))
     members = Members(
         jnp.asarray(np.stack(points)), jnp.asarray(np.stack([t[3] for t in truth])),
-        jnp.asarray([[[0.0, t[4]]] for t in truth]), jnp.zeros((2, 1)),
+        jnp.asarray([[[0.0, t[4]]] * 2 for t in truth]), jnp.asarray(np.log(np.full((2, 2), 0.5))),
     )  # fmt: skip
     past = np.concatenate([np.full(plan.lead, u[0]), u])[None, :, None]
-    told = jax.jit(lambda *args: forecast(plan.rule, members, *args, rows=ROWS, dt=DT))(
-        jnp.asarray(past), jnp.array([[0.2, -0.3]]), jnp.asarray(SPREAD), jnp.asarray(SPREAD), jnp.zeros(2, bool)
-    )
+    start, spread = jnp.array([[0.2, -0.3]]), jnp.asarray(SPREAD)
+    told = program(members, jnp.asarray(past), start, spread, spread, jnp.zeros(2, bool))
     for i, j in ((0, 1), (1, 0)):
         known, own = laws[i]
         wanted = expected(known, own) - expected(known, laws[j][1])
@@ -85,22 +92,21 @@ def test_the_figure_is_the_divergence_of_two_gaussians(sd: float) -> None:
     np.testing.assert_allclose(told.mean[0, 1].ravel(), laws[1][0][0], atol=1e-5)
 
 
-def test_louder_process_noise_is_a_way_out() -> None:
+def test_louder_process_noise_is_a_way_out(lane: tuple[Setup, Any]) -> None:
     """A member that may call everything noise is harder to tell from another."""
-    plan = setup(model(), recording(), (), [LOAD], 2)
-    p = np.tile(plan.augmented.neutral, (2, 1, 1))
+    plan, program = lane
+    p = np.tile(plan.augmented.neutral, (2, 5, 1))
     p[1, :, [q.name for q in plan.augmented.params].index("load_v_c")] = 1.0
     q = jnp.asarray([[[0.0, 0.01], [0.0, 1.0]]] * 2)
     u = np.zeros((1, plan.lead + ROWS, 1))
 
-    @jax.jit
-    def ratio(second: float) -> jax.Array:
-        weight = jnp.stack([jnp.stack([jnp.zeros_like(second), second])] * 2)
-        members = Members(jnp.asarray(p), jnp.full((2, 2), 0.05), q, weight)
-        args = (jnp.asarray(u), jnp.zeros((1, 2)), jnp.asarray(SPREAD), jnp.zeros(2), jnp.zeros(2, bool))
-        return forecast(plan.rule, members, *args, rows=ROWS, dt=DT).ratio[0, 0, 1]
-
-    ratios = [float(ratio(second)) for second in (-50.0, -2.0)]
+    ratios = []
+    for second in (-50.0, -2.0):
+        members = Members(jnp.asarray(p), jnp.asarray(np.full((2, 2), 0.05)), q, jnp.array([[0.0, second]] * 2))
+        told = program(
+            members, jnp.asarray(u), jnp.zeros((1, 2)), jnp.asarray(SPREAD), jnp.zeros(2), jnp.zeros(2, bool)
+        )
+        ratios.append(float(told.ratio[0, 0, 1]))
     assert 0 < ratios[1] < 0.5 * ratios[0]
 
 

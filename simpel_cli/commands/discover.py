@@ -18,10 +18,11 @@ from simpel_cli.discovery.corrected import corrected
 from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.selection import Search, Selection
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import setup, test_windows
-from simpel_cli.discovery.verdict import verdict_of
+from simpel_cli.discovery.verdict import AMBIGUOUS, verdict_of
 from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.nodes import build
 from simpel_cli.records import write_table, write_text
@@ -99,6 +100,9 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         options.horizon,
         time.perf_counter() - began,
     )
+    if found["verdict"] == AMBIGUOUS:
+        terminal.line("which experiment tells them apart", "search")
+        found["next_experiment"] = next_experiment(search, selection, directory)
     if len(found["effects"]) == len(selection.chosen.terms) > 0 and isinstance(config["sim"].get("dynamics"), dict):
         name, node, left_out = corrected(config["sim"], search, selection.chosen)
         path = directory / "conf" / "sim" / f"{name}.yaml"

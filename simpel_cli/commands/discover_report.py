@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ def sections_of(
         p.stem: columns_of(p) for p in directory.glob("*.parquet") if p.stem in ("errors", "parameters", "coverage")
     }
     pictures = {p.stem: figure(p) for p in draw_discover(directory)}
-    own = pictures.pop("parameters", {})
+    own, following = pictures.pop("parameters", {}), pictures.pop("next_experiment", {})
     parts = [
         error_section(found, tables.get("errors", {})),
         equation_section(found, before, after),
@@ -46,7 +46,7 @@ def sections_of(
         not_found_section(found),
         coverage_section(tables.get("coverage", {})),
         check_section(found),
-        next_section(found),
+        next_section(found) | {k: following[k] for k in ("image", "width") if k in following},
     ]
     return [part for part in parts if part]
 
@@ -296,15 +296,14 @@ def next_section(found: Mapping[str, Any]) -> Section:
     plan = found["next_experiment"]
     if not plan:
         return {}
-    if not isinstance(plan, Mapping):
-        return {"title": "Next experiment", "note": str(plan)}
-    rows = [[words(str(key)), _said(value)] for key, value in plan.items() if key != "summary"]
-    return {"title": "Next experiment", "note": plan.get("summary", ""), "rows": rows, "text": True}
-
-
-def _said(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(_said(v) for v in value)
-    return str(value)
+    rows = [
+        [words(p["true"]), words(p["against"]), f"{p['expected_log_likelihood_ratio']:.1f} nat"] for p in plan["pairs"]
+    ]
+    head = ["if this is the cause", "it beats", "by, expected"]
+    after = (
+        f"{plan['file']} holds time, inputs and what each cause predicts. Expected: how much the log evidence changes when "
+        "the episode is added to these data, with what is still uncertain about the parameters of both."
+        if plan["file"]
+        else ""
+    )
+    return {"title": "Next experiment", "note": plan["description"], "head": head, "rows": rows, "after": after}

@@ -53,6 +53,8 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     """Print the verdict on one screen."""
     terminal.line()
     terminal.line(found["summary"], style="bold")
+    if plan := found["next_experiment"]:
+        terminal.line(plan["description"], "experiment")
     terminal.line(_table(found, directory))
     good, _ = reliable(found)
     small = " · ".join(

@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from simpel_cli.discovery.filter import Filter, Noise, still
 
 LOG_2PI = float(np.log(2 * np.pi))
+Carry = tuple[Array, Array, Array]
 BATCH = 8  # episodes that are worked on at once: bounds the memory
 
 
@@ -158,7 +159,7 @@ def expected_log_density(
     half_true, half = jnp.diag(noises[0].q ** 2) * (dt / 2), jnp.diag(noises[1].q ** 2) * (dt / 2)
     apart = wrapped(true.mean - judge.mean, wraps)
 
-    def row(carry: tuple[Array, ...], data: tuple[Array, Path, Path]) -> tuple[tuple[Array, ...], Array]:
+    def row(carry: Carry, data: tuple[Array, Path, Path]) -> tuple[Carry, Array]:
         # estimate of (state, parameters), its covariance as claimed, covariance of (true state, estimate)
         estimate, claimed, joint = carry
         away, here, mine = data

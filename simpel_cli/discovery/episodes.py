@@ -100,7 +100,7 @@ def proposals(reach: Reach, inputs: int, n: int, random: np.random.Generator) ->
         for kind in DRIVEN
         for which in ([None] if inputs == 1 else [*range(inputs), None])
     ]
-    order = random.permutation(len(every)) if inputs else []
+    order = random.permutation(len(every))
     found = []
     for i in range(n):
         start = reach.rest if i == 0 else random_start(reach, random)

@@ -19,13 +19,13 @@ import numpy as np
 import pandas as pd
 
 from simpel_cli.discovery.discriminate import Forecast, Members, forecast
-from simpel_cli.discovery.episodes import FREE, Proposal, neighbours, proposals, reach_of, rows_of, signal
+from simpel_cli.discovery.episodes import Proposal, neighbours, proposals, reach_of, rows_of, signal
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.selection import TIE, Search, Selection, Trial
 from simpel_cli.records import write_text
 
 FILE = "next_experiment.csv"
-LOUDER = (1.0, 1.4, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0)  # factors on the process noise that a member may resort to
+LOUDER = (1.0, 1.5, 2.5, 5.0, 15.0, 100.0)  # factors on the process noise that a member may resort to
 BATCH = 32  # episodes per call of the compiled program
 WIDE, NEAR = 2, 3  # calls over the families, and near the best
 KEPT = 4  # episodes whose neighbours are tried
@@ -79,8 +79,8 @@ def next_experiment(search: Search, selection: Selection, directory: Path) -> di
     if best is None:
         names = " and ".join(_words(n) for n in tied.names)
         text = f"No episode was found that tells {names} apart and keeps all states within their declared ranges."
-        nothing = {"file": None, "start": None, "kind": None, "expected_log_likelihood_ratio": 0.0, "pairs": []}
-        return nothing | {"description": text}
+        nothing: dict[str, Any] = {"file": None, "start": None, "kind": None, "seconds": 0.0, "units": {}, "pairs": []}
+        return nothing | {"expected_log_likelihood_ratio": 0.0, "description": text}
     found = _verdict(search, tied, best)
     write_text(directory / FILE, _csv(search, tied, best, found))
     return found
@@ -93,7 +93,7 @@ def class_of(search: Search, selection: Selection) -> Class:
     for chosen, rivals in zip(selection.chosen.terms, selection.classes, strict=True):
         if any(terms[t.terms[-1]].depends_on for t in rivals):
             continue  # beaten by a function without a name: no class of names
-        others = {}
+        others: dict[str, Trial] = {}
         for trial in rivals:
             term = terms[trial.terms[-1]]
             if term.effect != terms[chosen].effect:
@@ -156,18 +156,17 @@ class Designer:
         start = np.stack([episodes[i].start for i in padded])
         spread = self.plan.windows.spread[0]
         given = (u, start, spread, np.zeros_like(spread), self.wraps)
-        told: Forecast = jax.tree.map(np.asarray, self._program(self.members, *(jnp.asarray(a) for a in given)))
-        fine = told.finite & self._inside(told.states)
+        told: Forecast = self._program(self.members, *(jnp.asarray(a) for a in given))
+        ratio, mean, states, finite = (np.asarray(a) for a in told)
+        fine = finite & self._inside(states)
         pairs = tuple(np.array(self.tied.pairs).T)
         designs = []
         for i, episode in enumerate(episodes):
             if fine[i]:
-                ratios = told.ratio[i][pairs]
+                ratios = ratio[i][pairs]
                 # between equals of the least pair, the others decide
                 score = ratios.min() + 0.01 * np.minimum(ratios, ENOUGH).mean()
-                designs.append(
-                    Design(episode, inputs[i], told.ratio[i], told.mean[i], float(ratios.min()), float(score))
-                )
+                designs.append(Design(episode, inputs[i], ratio[i], mean[i], float(ratios.min()), float(score)))
         return designs
 
     def _inside(self, states: np.ndarray) -> np.ndarray:
@@ -218,6 +217,7 @@ def _verdict(search: Search, tied: Class, best: Design) -> dict[str, Any]:
         "start": start,
         "kind": best.proposal.kind,
         "seconds": len(best.inputs) * model.dt,
+        "units": {q.name: q.unit for q in (*model.states, *model.inputs, *model.outputs)},
         "expected_log_likelihood_ratio": best.least,
         "pairs": pairs,
     }
@@ -239,10 +239,7 @@ def _sentence(search: Search, tied: Class, best: Design) -> str:
     i, j = min(tied.pairs, key=lambda pair: best.ratio[pair])
     names = f"{_words(tied.names[i])} and {_words(tied.names[j])}"
     others = " (any other pair of the class: more)" if len(tied.names) > 2 else ""
-    what = f"the {seconds} {best.proposal.kind} of {FILE}"
-    if best.proposal.kind == FREE:
-        what = f"a free response of {seconds}" + (" with the inputs at rest" if len(model.inputs) else "")
-    doing = f"{what} from {start}" + (f" ({spans})" if best.proposal.kind != FREE else "")
+    doing = f"the {seconds} {best.proposal.kind} of {FILE} from {start}" + (f" ({spans})" if spans else "")
     if best.least >= TIE:
         return f"Run {doing}: expected {best.least:.0f} nats between {names}{others}."
     least = max(best.least, 0.0)

@@ -8,6 +8,7 @@ from typing import Any
 from simpel_cli.plots.canvas import save
 from simpel_cli.plots.discover_evidence import draw_evidence, draw_parameters
 from simpel_cli.plots.discover_force import draw_effects, draw_residual
+from simpel_cli.plots.discover_next import draw_next
 from simpel_cli.plots.discover_runs import draw_errors, draw_traces, draw_whiteness
 
 
@@ -15,7 +16,7 @@ def draw_discover(directory: Path) -> list[Path]:
     """Draw every figure whose files are there, in the order in which a report shows them; returns their paths.
 
     Args:
-        directory: of the run, with `verdict.json` and Parquet files.
+        directory: of the run, with `verdict.json` and tables.
     """
     found = json.loads((directory / "verdict.json").read_text())
     parts: list[tuple[str, tuple[str, ...], Callable[..., Any]]] = [
@@ -26,6 +27,7 @@ def draw_discover(directory: Path) -> list[Path]:
         ("parameters", ("parameters.parquet",), draw_parameters),
         ("whiteness", ("innovations.parquet",), draw_whiteness),
         ("errors", ("errors.parquet",), draw_errors),
+        ("next_experiment", ("next_experiment.csv",), draw_next),
     ]
     drawn = []
     for name, sources, draw in parts:
