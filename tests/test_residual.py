@@ -35,7 +35,7 @@ class Linear:
                 gain = p @ c.T @ np.linalg.inv(c @ p @ c.T + np.diag(self.r[good]))
                 x = x + gain @ (y_k[good] - c @ x)
                 p = p - gain @ c @ p
-            rows.append((y_k, self.r, predicted, predicted_cov, x, p, self.a))
+            rows.append((y_k, self.r, predicted, predicted_cov, x, p, self.a, self.c))
             x, p = self.a @ x + self.b, self.a @ p @ self.a.T + self.q
         return Track(*(np.stack(column)[None] for column in zip(*rows, strict=True)))
 

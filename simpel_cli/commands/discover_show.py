@@ -54,7 +54,7 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     terminal.line()
     terminal.line(found["summary"], style="bold")
     if plan := found["next_experiment"]:
-        terminal.line(plan["description"], "experiment")
+        terminal.line(plan["description"], "run next")
     terminal.line(_table(found, directory))
     good, _ = reliable(found)
     small = " · ".join(

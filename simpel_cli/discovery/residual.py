@@ -42,7 +42,8 @@ class Smoothed(NamedTuple):
 
 def smooth(track: Track) -> Smoothed:
     """Run the Rauch-Tung-Striebel smoother backwards over the filter's track, (W, T, ...) each."""
-    fields = [np.asarray(a, float) for a in track[2:]]
+    given = (track.predicted, track.predicted_cov, track.mean, track.cov, track.jacobian)
+    fields = [np.asarray(a, float) for a in given]
     finite = np.all([np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in fields], axis=0)
     eye = np.eye(fields[0].shape[-1])
     predicted, predicted_cov, mean, cov, jacobian = (
