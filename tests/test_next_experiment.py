@@ -88,6 +88,8 @@ def test_the_figure_is_the_divergence_of_two_gaussians(lane: tuple[Setup, Any], 
         np.testing.assert_allclose(told.ratio[0, i, j], wanted, rtol=1e-5)
         if sd == 0:
             assert wanted > 1  # a Kullback-Leibler divergence
+        aside = (laws[i][0][0] - laws[j][0][0]) @ np.linalg.solve(laws[j][1][1], laws[i][0][0] - laws[j][0][0]) / 2
+        np.testing.assert_allclose(told.distance[0, i, j], aside, rtol=1e-5)
     assert told.finite.all()
     np.testing.assert_allclose(told.mean[0, 1].ravel(), laws[1][0][0], atol=1e-5)
 

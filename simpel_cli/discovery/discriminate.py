@@ -11,6 +11,12 @@ Kullback-Leibler divergence, and without noise that differs the squared distance
 what it does not explain process noise: p_j is a mixture over louder levels of it, weighted by what the data so far gave
 them, and the expectation of a mixture's logarithm is taken inside of it.
 
+Part of D_ij is that i and j disturb themselves differently. That is only as good as the linearisation: at standstill a dry
+friction is linearised as a stiff damper, whose noise looks like no other's. So the distance of the means is given, too, by
+how much less j thinks of the mean of i than of its own, with its own noise about both:
+
+    d_ij = E[log p_j(m_j + v) - log p_j(m_i + v)],  v ~ N(0, V_j)    (1/2 (m_i - m_j)' (V_j + A_j A_j')^-1 (m_i - m_j))
+
 Everything is exact for linear models: the parameters are constant states of a Kalman filter, and one recursion follows
 mean and covariance of true state and filter together.
 
@@ -62,13 +68,15 @@ class Forecast(NamedTuple):
     """What the members predict for N episodes.
 
     Args:
-        ratio: (N, M, M) expected log-likelihood ratio of the first over the second when the first is true, nats.
+        ratio: (N, M, M) expected log-likelihood ratio D of the first over the second when the first is true, nats.
+        distance: (N, M, M) the part d of it that the means have, nats.
         mean: (N, M, T, ny) measurements, periodic ones within -pi..pi.
         states: (N, M, T, nx).
         finite: (N,) whether everything is.
     """
 
     ratio: Float[Array, "N M M"]
+    distance: Float[Array, "N M M"]
     mean: Float[Array, "N M T ny"]
     states: Float[Array, "N M T nx"]
     finite: Bool[Array, " N"]
@@ -104,7 +112,7 @@ def forecast(
     nothing = jnp.zeros((rows, ny), start.dtype)
     silent = Noise(jnp.ones(ny, start.dtype), jnp.zeros(nx, start.dtype))
 
-    def one(episode: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+    def one(episode: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
         inputs, x = episode
 
         def run(p: Array) -> tuple[Array, Array, Array, Array]:
@@ -128,11 +136,20 @@ def forecast(
         density = jax.vmap(by_judge, in_axes=(0, 0, 0, None, None, None, None))(
             paths, members.r, members.q[:, 0], paths, members.r, members.q, members.log_weight
         )
-        return jnp.diag(density)[:, None] - density, mean[:, 0], states[:, 0]
 
-    ratio, mean, states = jax.lax.map(one, (u, start), batch_size=BATCH)
+        def shifted(true: Array, path: Path, r: Array, q: Array, weight: Array) -> Array:
+            return judge(path._replace(mean=true), r, q[0], path, r, q, weight)
+
+        by_shift = jax.vmap(shifted, in_axes=(None, 0, 0, 0, 0))
+        aside = jax.vmap(by_shift, in_axes=(0, None, None, None, None))(
+            paths.mean, paths, members.r, members.q, members.log_weight
+        )
+        own = jnp.diag(density)
+        return own[:, None] - density, own[None, :] - aside, mean[:, 0], states[:, 0]
+
+    ratio, distance, mean, states = jax.lax.map(one, (u, start), batch_size=BATCH)
     finite = jnp.isfinite(ratio).all((1, 2)) & jnp.isfinite(states).all((1, 2, 3)) & jnp.isfinite(mean).all((1, 2, 3))
-    return Forecast(ratio, mean, states, finite)
+    return Forecast(ratio, distance, mean, states, finite)
 
 
 def expected_log_density(

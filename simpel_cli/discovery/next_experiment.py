@@ -1,6 +1,6 @@
 """The episode that tells tied causes apart: the one whose least expected log-likelihood ratio is the largest.
 
-    max over admissible episodes of min over ordered pairs (i, j) of the class of D_ij    (see `discriminate`)
+    max over admissible episodes of min over ordered pairs (i, j) of the class of min(D_ij, d_ij)    (see `discriminate`)
 
 Admissible are inputs within their declared ranges, starts that the data cover, and states that stay within their
 declared ranges under every member. Families that a person can run are tried first, then neighbours of the best.
@@ -157,8 +157,9 @@ class Designer:
         spread = self.plan.windows.spread[0]
         given = (u, start, spread, np.zeros_like(spread), self.wraps)
         told: Forecast = self._program(self.members, *(jnp.asarray(a) for a in given))
-        ratio, mean, states, finite = (np.asarray(a) for a in told)
+        ratio, distance, mean, states, finite = (np.asarray(a) for a in told)
         fine = finite & self._inside(states)
+        ratio = np.minimum(ratio, distance)  # what the noise alone would tell is not relied on
         pairs = tuple(np.array(self.tied.pairs).T)
         designs = []
         for i, episode in enumerate(episodes):
@@ -258,12 +259,12 @@ def _csv(search: Search, tied: Class, best: Design, found: dict[str, Any]) -> st
     """Return the episode as CSV: time, inputs, and what each member predicts to be measured."""
     model, measured = search.plan.augmented.model, search.plan.augmented.measured
     units = {q.name: q.unit for q in (*model.states, *model.inputs)}
-    columns: dict[str, np.ndarray] = {"time": np.arange(len(best.inputs)) * model.dt}
+    columns: dict[str, np.ndarray] = {"time": np.round(np.arange(len(best.inputs)) * model.dt, 9)}
     columns |= {q.name: best.inputs[:, k] for k, q in enumerate(model.inputs)}
     periodic = {q.name for q in model.states if q.periodic}
     for i, name in enumerate(tied.names):
         for k, channel in enumerate(measured):
-            mean = best.mean[i, :, k]
+            mean = best.mean[i, :, k] + 0.0  # no -0
             columns[f"{channel}_if_{name}"] = np.unwrap(mean) if channel in periodic else mean
     start = ", ".join(f"{n} = {v!r} {units[n]}".rstrip() for n, v in found["start"].items())
     notes = [

@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from simpel_cli.plots.canvas import BLACK, legend_below, line_style, new_figure, with_unit
+from simpel_cli.plots.canvas import BLACK, COLOURS, DASHES, legend_below, new_figure, with_unit
 
 PREDICTED = "_if_"  # in a column: <channel>_if_<effect>
 
@@ -23,8 +23,11 @@ def draw_next(found: dict[str, Any], path: Path) -> Any:
         if name in inputs:
             axis.step(table["time"], table[name], where="post", color=BLACK, linewidth=1.1)
         for i, effect in enumerate(effect for channel, effect in predicted if channel == name):
-            label = f"if {effect.replace('_', ' ')}"
-            axis.plot(table["time"], table[f"{name}{PREDICTED}{effect}"], **line_style(i), linewidth=1.3, label=label)
+            # dashes let a curve be seen that lies under another
+            axis.plot(
+                table["time"], table[f"{name}{PREDICTED}{effect}"], DASHES[i % len(DASHES)],
+                color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=f"if {effect.replace('_', ' ')}",
+            )  # fmt: skip
         axis.set(ylabel=with_unit(name, units.get(name, "")))
     axes[-1].set_xlabel("time [s]")
     legend_below(figure, axes[-1])
