@@ -135,7 +135,7 @@ def pendulum() -> Any:
     ).model()  # fmt: skip
 
 
-def swings(tau: float = 0.5, rows: int = 30) -> Recording:
+def swings(tau: float = 0.35, rows: int = 30) -> Recording:
     """Swings of the pendulum with dry friction, of nearly one size: weak data, on which any friction does."""
     random = np.random.default_rng(5)
     episodes = []
