@@ -1,84 +1,96 @@
-"""The blind exam: `python -m tests.exam --sets 600 --seed 1 --out /somewhere` (first version: the pendulum, one effect).
+"""The blind exam: `python -m tests.exam --sets 600 --seed 1 --out /somewhere`.
 
 Every set is written, given to `simpel discover` as a user would, and scored against a truth that the tool cannot reach.
+`--out` of an earlier exam goes on with it; `--score-only` scores anew what was run there.
 """
 
 import argparse
 import json
-import subprocess
-import sys
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
-from scipy.stats import beta
 
-from tests.exam.generate import draw, write
+from tests.exam import rivals, tool
+from tests.exam.campaign import keep, neighbours, run, score_file
+from tests.exam.draw import draw
+from tests.exam.examine import examine, places
+from tests.exam.table import report
+from tests.exam.write import write
 
-
-def examine(index: int, seed: int, out: Path) -> dict:
-    drawn, folder = draw(index, seed), out / "sets" / f"{index}"
-    truth = out / "truth" / f"{index}.json"
-    write(drawn, folder, truth)
-    words = ["--config-dir", folder, "sim=pendulum", "data=exam", "close=false", f"hydra.run.dir={folder / 'run'}"]
-    argv = [sys.executable, "-m", "simpel_cli.main", "discover", *map(str, words), "run.quiet=true"]
-    ended = subprocess.run(argv, capture_output=True, text=True, check=False)
-    row = drawn._asdict() | {"index": index, "code": ended.returncode}
-    if ended.returncode:
-        return row | {"outcome": "error", "message": ended.stderr.strip()[-300:]}
-    found = json.loads((folder / "run" / "verdict.json").read_text())
-    names = [name for effect in found["effects"] for name in effect["class"]]
-    tried = pd.read_parquet(folder / "run" / "candidates.parquet")
-    own = tried[(tried.effect == drawn.effect) & (tried.step == 1)].log_evidence_gain
-    return row | {
-        "outcome": _outcome(drawn.effect, found, names), "verdict": found["verdict"], "names": names,
-        "evidence": float(own.max()) if len(own) else 0.0, "seconds": found["seconds"],
-    }  # fmt: skip
-
-
-def _outcome(planted: str, found: dict, names: list[str]) -> str:
-    if not names:
-        return "nothing" if planted or found["verdict"] == "unexplained" else "right"
-    if not planted:
-        return "false effect"
-    if names == [planted]:
-        return "right"
-    return "tie" if planted in names else "wrong"
-
-
-def interval(k: int, n: int) -> str:
-    """Clopper and Pearson (1934), 95 %."""
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return f"{k}/{n} = {k / max(n, 1):.0%} ({low:.0%}..{high:.0%})"
+MOST_WORKERS = 2
+TUNING, TUNING_SEED = 40, 1_000_003  # sets on which the rival's threshold is tuned; no set of the exam is among them
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Run the exam."""
+    parser = argparse.ArgumentParser(prog="tests.exam", description=__doc__)
     parser.add_argument("--sets", type=int, default=600)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--workers", type=int, default=2, choices=range(1, MOST_WORKERS + 1))
+    parser.add_argument("--score-only", type=Path, metavar="DIR", help="score the runs of an earlier exam anew")
     options = parser.parse_args()
-    rows = []
-    with ThreadPoolExecutor(options.workers) as pool:
-        for row in pool.map(lambda i: examine(i, options.seed, options.out), range(options.sets)):
-            rows.append(row)
-            print({k: row.get(k) for k in ("index", "effect", "strength", "noise", "measured", "outcome", "names", "evidence", "seconds")}, flush=True)  # fmt: skip  # noqa: E501
-    table = pd.DataFrame(rows)
-    table.to_parquet(options.out / "scores.parquet")
-    planted = table[table.effect != ""]
-    clear = planted[planted.evidence >= 10]
-    count = Counter(clear.outcome)
-    print("named exactly or in a tie, evidence >= 10:", interval(count["right"] + count["tie"], len(clear)))
-    print("named exactly, evidence >= 10:", interval(count["right"], len(clear)))
-    print("wrong name, all:", interval(int((planted.outcome == "wrong").sum()), len(planted)))
-    none = table[table.effect == ""]
-    print("false effect where there is none:", interval(int((none.outcome == "false effect").sum()), len(none)))
-    print(
-        "errors:", int((table.outcome == "error").sum()), "median seconds:", table.get("seconds", pd.Series()).median()
-    )
+    if (options.out is None) == (options.score_only is None):
+        parser.error("give either --out DIR or --score-only DIR")
+    out = (options.out or options.score_only).resolve()
+    if options.score_only:
+        finish(out, [again(path, out) for path in sorted((out / "scores").glob("*.json"))])
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    told = {"seed": options.seed}
+    plan = out / "exam.json"
+    if plan.exists() and json.loads(plan.read_text())["seed"] != options.seed:
+        parser.error(f"{out} holds the exam with seed {json.loads(plan.read_text())['seed']}")
+    plan.write_text(json.dumps(told | {"sets": options.sets, "thresholds": tuned(out)}))
+    thresholds = json.loads(plan.read_text())["thresholds"]
+    sets = [draw(i, options.seed) for i in range(options.sets)]
+    waiting = sorted((d for d in sets if not score_file(out, d.index).exists()), key=neighbours)
+    run(waiting, out, thresholds, options.workers)
+    finish(out, [json.loads(score_file(out, i).read_text()) for i in range(options.sets)])
+
+
+def again(path: Path, out: Path) -> dict[str, Any]:
+    """Score anew; what was not run stays as it was."""
+    old = json.loads(path.read_text())
+    drawn = draw(old["index"], json.loads((out / "exam.json").read_text())["seed"])
+    if not (places(out, drawn.index)[0] / "run" / "verdict.json").exists():
+        return old
+    row = examine(drawn, out, json.loads((out / "exam.json").read_text())["thresholds"]) | {"wall": old["wall"]}
+    keep(out, row)
+    return row
+
+
+def tuned(out: Path) -> dict[str, float]:
+    """Return the threshold with which PySINDy is right most often on sets that are not of the exam."""
+    if not rivals.installed():
+        return {}
+    if (out / "exam.json").exists():
+        return json.loads((out / "exam.json").read_text()).get("thresholds") or {}
+    right: Counter[float] = Counter()
+    for index in range(TUNING):
+        drawn = draw(index, TUNING_SEED)
+        folder, file = places(out / "tuning", index)
+        write(drawn, folder, file)
+        truth = json.loads(file.read_text())
+        made = rivals.problem(folder, drawn.system, truth["measured"])
+        for threshold in rivals.THRESHOLDS if made else ():
+            right[threshold] += rivals.graded(truth, rivals.sparse(made, threshold)) == "right"
+    tool.clear(out / "tuning")
+    return {rivals.SINDY: max(rivals.THRESHOLDS, key=lambda t: right[t])}
+
+
+def finish(out: Path, rows: list[dict[str, Any]]) -> None:
+    """Write and print the table."""
+    scores = pd.DataFrame(rows).sort_values("index")
+    for name in ("evidence", "names", "message"):
+        if name not in scores:
+            scores[name] = None
+    scores.to_parquet(out / "scores.parquet")
+    text = report(scores)
+    (out / "table.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

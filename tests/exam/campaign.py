@@ -1,0 +1,83 @@
+"""Many sets in few processes: programs are compiled once per kind of set, and what fails takes nothing else with it."""
+
+import json
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from tests.exam.draw import Set
+from tests.exam.examine import examine
+
+SETS_PER_PROCESS = 40  # then a fresh one: compiled programs take memory
+
+
+def neighbours(drawn: Set) -> tuple[str, tuple[str, ...], int]:
+    """Sets that share compiled programs are next to each other."""
+    return drawn.system, drawn.measured, drawn.index
+
+
+def run(waiting: list[Set], out: Path, thresholds: dict[str, float], workers: int) -> None:
+    """Examine sets in few processes; one that dies takes the sets with it that it was at, and no others."""
+    while waiting:
+        context = multiprocessing.get_context("spawn")
+        begun = {d.index: out / "begun" / str(d.index) for d in waiting}
+        for mark in begun.values():  # of an exam that was interrupted
+            mark.unlink(missing_ok=True)
+        with ProcessPoolExecutor(workers, context, max_tasks_per_child=SETS_PER_PROCESS) as pool:
+            futures = {pool.submit(one, d, out, thresholds): d for d in waiting}
+            for future in as_completed(futures):
+                try:
+                    told(future.result())
+                except BrokenProcessPool:
+                    break
+                except Exception as error:
+                    told(lost(futures[future], out, f"{type(error).__name__}: {error}"))
+        left = [d for d in waiting if not score_file(out, d.index).exists()]
+        died = [d for d in left if begun[d.index].exists()]
+        for d in died:
+            told(lost(d, out, "the process died"))
+        if left and not died and len(left) == len(waiting):
+            raise RuntimeError("no process could be started: see the messages above")
+        waiting = [d for d in left if d not in died]
+
+
+def one(drawn: Set, out: Path, thresholds: dict[str, float]) -> dict[str, Any]:
+    """Examine one set and keep its score."""
+    mark = out / "begun" / str(drawn.index)
+    mark.parent.mkdir(exist_ok=True)
+    mark.touch()
+    row = examine(drawn, out, thresholds)
+    keep(out, row)
+    mark.unlink()
+    return row
+
+
+def lost(drawn: Set, out: Path, message: str) -> dict[str, Any]:
+    """Keep the row of a set whose process failed outside the tool's own errors."""
+    row = {n: v for n, v in drawn._asdict().items() if n not in ("planted", "strength", "seed")} | {
+        "planted": "+".join(drawn.planted), "outcome": "error", "message": message, "wall": None,
+    }  # fmt: skip
+    keep(out, row)
+    return row
+
+
+def keep(out: Path, row: dict[str, Any]) -> None:
+    """Write the score of a set."""
+    score_file(out, row["index"]).parent.mkdir(exist_ok=True)
+    score_file(out, row["index"]).write_text(json.dumps(row))
+
+
+def score_file(out: Path, index: int) -> Path:
+    """Where the score of a set is kept."""
+    return out / "scores" / f"{index}.json"
+
+
+def told(row: dict[str, Any]) -> None:
+    """Print one line."""
+    shown = ("index", "system", "condition", "noise", "planted", "outcome", "names", "evidence", "wall", "message")
+    print(
+        " · ".join(f"{row.get(n):.3g}" if isinstance(row.get(n), float) else str(row.get(n, "")) for n in shown),
+        flush=True,
+    )

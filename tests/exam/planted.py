@@ -1,0 +1,333 @@
+"""What can be planted: the exam's own formulas of missing physics, with the size that each has at full strength.
+
+Names and parameter labels are those of the tool's catalogue, since they are what an answer is compared with; formulas are not
+taken from there. Dry friction is a ramp here, a stop is a stiff spring, and nothing is smoothed for an optimiser's sake.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+RATE, INPUT, SENSOR, DELAY, LAG, LATE_SENSOR = "rate", "input", "sensor", "delay", "lag", "late sensor"
+ONE, SHAPE, OUTSIDE, ABSORBED = "one", "shape", "outside", "absorbed"
+
+Knobs = Mapping[str, float]
+Formula = Callable[..., np.ndarray]
+
+
+class Effect(NamedTuple):
+    """Something that a simulator can lack.
+
+    Args:
+        name: of the catalogue; a name of the exam's where the catalogue has none.
+        acts_on: state, input or measured quantity.
+        kind: RATE: formula(v, s, t, knobs, x, u) is added to the rate of `acts_on` (v itself, s the position or other
+            state); INPUT, SENSOR: formula(value, knobs) stands in its place; DELAY, LAG, LATE_SENSOR: one knob, s.
+        full: knobs at full strength; those in `sized` are proportional to the strength, the others fixed.
+        sized: names of knobs that the strength scales. A knob `limit` shrinks instead.
+        formula: see `kind`.
+        group: ONE: in the catalogue; SHAPE: of a similar shape as the names in `accept`; OUTSIDE: nothing of the kind;
+            ABSORBED: the parameters of the simulator take it in, so that nothing is missing.
+        accept: names that are right.
+        both: only where position and velocity (all states) are measured.
+    """
+
+    name: str
+    acts_on: str
+    kind: str
+    full: dict[str, float]
+    sized: tuple[str, ...]
+    formula: Formula | None = None
+    group: str = ONE
+    accept: tuple[str, ...] = ()
+    both: bool = False
+
+    @property
+    def key(self) -> str:
+        """Name and place."""
+        return f"{self.name}@{self.acts_on}"
+
+    def knobs(self, strength: float) -> dict[str, float]:
+        """Return the parameters at a strength within 0..1."""
+        return {n: v * strength if n in self.sized else v for n, v in self.full.items()} | (
+            {"limit": self.full["limit"] * (1 - 0.7 * strength)} if "limit" in self.full else {}
+        )
+
+
+def ramp(v: np.ndarray, width: float) -> np.ndarray:
+    """Sign of a speed, linear below `width`."""
+    return np.clip(v / width, -1.0, 1.0)
+
+
+def _beyond(value: np.ndarray, limit: float) -> np.ndarray:
+    return value - np.clip(value, -limit, limit)
+
+
+def _viscous(v, s, t, k, x, u):
+    return -k["b"] * v
+
+
+def _coulomb(v, s, t, k, x, u):
+    return -k["tau_c"] * ramp(v, k["_width"])
+
+
+def _stribeck(v, s, t, k, x, u):
+    return -(k["tau_c"] + k["tau_s"] * np.exp(-((v / k["v_s"]) ** 2))) * ramp(v, k["_width"])
+
+
+def _asymmetric(v, s, t, k, x, u):
+    side = ramp(v, k["_width"])
+    return np.where(v > 0, -k["tau_p"] * side, -k["tau_n"] * side)
+
+
+def _quadratic(v, s, t, k, x, u):
+    return -k["c"] * v * np.abs(v)
+
+
+def _constant(v, s, t, k, x, u):
+    return np.full_like(v, k["c"])
+
+
+def _spring(v, s, t, k, x, u):
+    return -k["k"] * s
+
+
+def _cubic(v, s, t, k, x, u):
+    return -k["k_3"] * s**3
+
+
+def _stop(v, s, t, k, x, u):
+    return -k["k"] * _beyond(s, k["s_max"])
+
+
+def _cogging(v, s, t, k, x, u):
+    return k["a"] * np.sin(k["n"] * s) + k["b"] * np.cos(k["n"] * s)
+
+
+def _tilt(v, s, t, k, x, u):
+    return k["a"] * np.cos(s)
+
+
+def _leak(v, s, t, k, x, u):
+    return -k["k"] * v
+
+
+def _outflow(v, s, t, k, x, u):
+    return -k["k"] * np.maximum(v, 0.0) ** k["n"]
+
+
+def _overflow(v, s, t, k, x, u):
+    return -k["k"] * np.maximum(v - k["x_max"], 0.0)
+
+
+def _exchange(v, s, t, k, x, u):
+    return k["k"] * (k["x_a"] - v)
+
+
+def _crowding(v, s, t, k, x, u):
+    return -k["k"] * v**2
+
+
+def _coupling(v, s, t, k, x, u):
+    return k["k"] * (s - v)
+
+
+def _beat(v, s, t, k, x, u):
+    return np.full_like(v, k["_force"] * np.sin(2 * np.pi * t / k["_period"] + k["_phase"]))
+
+
+def _inertia(v, s, t, k, x, u):
+    raise NotImplementedError("scales the whole rate: see record.plant")
+
+
+def friction(place: str, tau: float, width: float, v_s: float) -> list[Effect]:
+    """Dry friction of three kinds; tau is its acceleration at full strength."""
+    return [
+        Effect("coulomb_friction", place, RATE, {"tau_c": tau, "_width": width}, ("tau_c",), _coulomb),
+        Effect(
+            "stribeck_friction", place, RATE, {"tau_c": 0.6 * tau, "tau_s": tau, "v_s": v_s, "_width": width},
+            ("tau_c", "tau_s"), _stribeck,
+        ),
+        Effect(
+            "asymmetric_friction", place, RATE, {"tau_p": tau, "tau_n": 0.25 * tau, "_width": width},
+            ("tau_p", "tau_n"), _asymmetric,
+        ),
+    ]  # fmt: skip
+
+
+def commands(place: str, largest: float, delay: float, lag: float, *, signed: bool = True) -> list[Effect]:
+    """Faults of an actuator whose command reaches `largest`; those that need both signs, or a zero, only if `signed`."""
+    found = [
+        Effect("input_delay", place, DELAY, {"d": delay}, ("d",)),
+        Effect("input_lag", place, LAG, {"tau": lag}, ("tau",)),
+        Effect("input_saturation", place, INPUT, {"limit": largest}, (), lambda u, k: np.clip(u, -k["limit"], k["limit"])),
+        Effect("quadratic_input", place, INPUT, {"c": 0.6 / largest}, ("c",), lambda u, k: u + k["c"] * u * np.abs(u)),
+        Effect(
+            "tanh_saturation", place, INPUT, {"_limit": largest, "_over": 1.0}, ("_over",),
+            lambda u, k: k["_limit"] / k["_over"] * np.tanh(u * k["_over"] / k["_limit"]), SHAPE,
+            ("input_saturation", "quadratic_input"),
+        ),
+    ]  # fmt: skip
+    if not signed:
+        return found
+    return [
+        *found,
+        Effect("input_dead_zone", place, INPUT, {"d": 0.33 * largest}, ("d",), lambda u, k: _beyond(u, k["d"])),
+        Effect("input_gain_asymmetry", place, INPUT, {"a": 0.4}, ("a",), lambda u, k: u + k["a"] * np.abs(u)),
+        Effect("input_offset", place, INPUT, {"b": 0.3 * largest}, ("b",), lambda u, k: u + k["b"]),
+        Effect(
+            "soft_dead_zone", place, INPUT, {"_d": 0.3 * largest}, ("_d",), lambda u, k: u**3 / (u**2 + k["_d"] ** 2),
+            SHAPE, ("input_dead_zone",),
+        ),
+    ]  # fmt: skip
+
+
+def bias(place: str, size: float) -> Effect:
+    """A sensor that is off by a constant."""
+    return Effect("sensor_bias", place, SENSOR, {"b": size}, ("b",), lambda y, k: y + k["b"])
+
+
+def scale(place: str, size: float) -> Effect:
+    """A sensor that is off by a factor; the other sensors must tell."""
+    return Effect("sensor_scale", place, SENSOR, {"a": size}, ("a",), lambda y, k: y * (1 + k["a"]), both=True)
+
+
+def late(place: str, size: float) -> Effect:
+    """A sensor that reports late; with the others in time."""
+    return Effect("sensor_delay", place, LATE_SENSOR, {"d": size}, ("d",), both=True)
+
+
+def rate(name: str, place: str, formula: Formula, sized: str, **full: float) -> Effect:
+    """A term of the catalogue in a rate; `sized` is the knob that the strength scales."""
+    return Effect(name, place, RATE, full, (sized,), formula)
+
+
+def shape(name: str, place: str, accept: tuple[str, ...], size: float, formula: Formula) -> Effect:
+    """A term of a shape that the catalogue has not, near those in `accept`."""
+    return Effect(name, place, RATE, {"_k": size}, ("_k",), formula, SHAPE, accept)
+
+
+def outside(name: str, place: str, size: float, formula: Formula) -> Effect:
+    """A term that no name of the catalogue is near."""
+    return Effect(name, place, RATE, {"_k": size}, ("_k",), formula, OUTSIDE)
+
+
+def beat(place: str, size: float, period: float) -> Effect:
+    """A force that swings with time, whatever the state does."""
+    return Effect(
+        "periodic_force", place, RATE, {"_force": size, "_period": period, "_phase": 0.7}, ("_force",), _beat, OUTSIDE
+    )
+
+
+_DRAG = ("quadratic_drag", "viscous_friction")
+
+EFFECTS: dict[str, list[Effect]] = {
+    "pendulum": [
+        rate("viscous_friction", "omega", _viscous, "b", b=0.8), *friction("omega", 2.0, 0.01, 0.8),
+        rate("quadratic_drag", "omega", _quadratic, "c", c=0.3), rate("constant_load", "omega", _constant, "c", c=2.0),
+        rate("linear_stiffness", "omega", _spring, "k", k=3.0), rate("cubic_stiffness", "omega", _cubic, "k_3", k_3=0.6),
+        Effect("cogging", "omega", RATE, {"a": 1.0, "b": 1.0, "n": 4.0}, ("a", "b"), _cogging),
+        rate("gravity_tilt", "omega", _tilt, "a", a=1.5),
+        Effect("added_inertia", "omega", RATE, {"alpha": 0.6}, ("alpha",), _inertia),
+        *commands("u", 2.5, 0.12, 0.15), bias("phi", 0.15), scale("omega", 0.25), late("omega", 0.08),
+        shape("wide_ramp_friction", "omega", ("coulomb_friction",), 2.0, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.3)),
+        shape("drag_of_power_1.5", "omega", _DRAG, 0.5, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
+        outside("friction_of_position", "omega", 4.0, lambda v, s, t, k, x, u: -k["_k"] * np.sin(s) ** 2 * ramp(v, 0.05)),
+        outside("angle_times_speed", "omega", 1.2, lambda v, s, t, k, x, u: k["_k"] * np.sin(s) * v),
+        beat("omega", 3.0, 1.1),
+    ],
+    "cart": [
+        *friction("v", 1.5, 0.003, 0.25), rate("quadratic_drag", "v", _quadratic, "c", c=3.0),
+        rate("constant_load", "v", _constant, "c", c=2.0), rate("cubic_stiffness", "v", _cubic, "k_3", k_3=600.0),
+        rate("end_stop", "v", _stop, "k", k=300.0, s_max=0.13),
+        Effect("viscous_friction", "v", RATE, {"b": 0.4}, ("b",), _viscous, ABSORBED),
+        Effect("linear_stiffness", "v", RATE, {"k": 3.0}, ("k",), _spring, ABSORBED),
+        Effect("added_inertia", "v", RATE, {"alpha": 0.07}, ("alpha",), _inertia, ABSORBED),
+        *commands("u", 3.0, 0.1, 0.12), bias("s", 0.03), scale("v", 0.25), late("v", 0.06),
+        shape("wide_ramp_friction", "v", ("coulomb_friction",), 1.5, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.06)),
+        shape("drag_of_power_1.5", "v", ("quadratic_drag",), 3.0, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
+        shape("spring_of_power_5", "v", ("cubic_stiffness", "end_stop"), 8000.0, lambda v, s, t, k, x, u: -k["_k"] * s**5),
+        outside("friction_of_position", "v", 120.0, lambda v, s, t, k, x, u: -k["_k"] * s**2 * v),
+        outside("position_times_speed", "v", 16.0, lambda v, s, t, k, x, u: k["_k"] * s * v),
+        beat("v", 3.0, 0.7),
+    ],
+    "tanks": [
+        rate("leak", "h_1", _leak, "k", k=0.02), rate("leak", "h_2", _leak, "k", k=0.02),
+        rate("outflow_exponent", "h_2", _outflow, "k", k=0.004, n=1.5),
+        rate("overflow", "h_1", _overflow, "k", k=0.2, x_max=38.0), rate("overflow", "h_2", _overflow, "k", k=0.2, x_max=20.0),
+        rate("ambient_exchange", "h_2", _exchange, "k", k=0.04, x_a=30.0),
+        rate("constant_inflow", "h_1", _constant, "c", c=0.6), rate("constant_inflow", "h_2", _constant, "c", c=0.6),
+        rate("crowding", "h_1", _crowding, "k", k=4e-4),
+        *commands("u", 6.0, 10.0, 12.0, signed=False), bias("h_2", 3.0), scale("h_2", 0.15), late("h_1", 8.0),
+        shape("weir", "h_1", ("overflow",), 0.06, lambda v, s, t, k, x, u: -k["_k"] * np.maximum(v - 35.0, 0.0) ** 1.5),
+        shape("outflow_of_power_0.8", "h_2", ("outflow_exponent", "leak"), 0.06,
+              lambda v, s, t, k, x, u: -k["_k"] * np.maximum(v, 0.0) ** 0.8),
+        outside("pump_against_head", "h_1", 0.006, lambda v, s, t, k, x, u: -k["_k"] * v * u[..., 0]),
+        beat("h_2", 0.6, 60.0),
+    ],
+    "thermal": [
+        rate("thermal_coupling", "T_1", _coupling, "k", k=0.008), rate("constant_inflow", "T_1", _constant, "c", c=0.12),
+        rate("constant_inflow", "T_2", _constant, "c", c=0.12), rate("crowding", "T_1", _crowding, "k", k=1e-4),
+        rate("overflow", "T_1", _overflow, "k", k=0.03, x_max=42.0),
+        *commands("u", 1.0, 30.0, 40.0, signed=False), bias("T_2", 4.0), scale("T_1", 0.15), late("T_1", 20.0),
+        Effect("input_dead_zone", "u", INPUT, {"d": 0.3}, ("d",), lambda u, k: _beyond(u, k["d"])),
+        Effect("input_offset", "u", INPUT, {"b": 0.3}, ("b",), lambda u, k: u + k["b"]),
+        shape("radiation", "T_1", ("crowding",), 0.25, lambda v, s, t, k, x, u: -k["_k"] * (((v + 273) / 320) ** 4 - 0.7)),
+        outside("product_of_temperatures", "T_2", 1.5e-4, lambda v, s, t, k, x, u: -k["_k"] * (v - 20) * (s - 20)),
+        outside("fan_with_heater", "T_1", 0.02, lambda v, s, t, k, x, u: -k["_k"] * (v - 20) * u[..., 0]),
+        beat("T_1", 0.25, 140.0),
+    ],
+    "car": [
+        *friction("v", 2.0, 0.02, 0.6), rate("quadratic_drag", "v", _quadratic, "c", c=0.5),
+        rate("constant_load", "v", _constant, "c", c=1.5),
+        Effect("viscous_friction", "v", RATE, {"b": 0.15}, ("b",), _viscous, ABSORBED),
+        *commands("steer", 1.0, 0.15, 0.2), *commands("throttle", 1.0, 0.15, 0.2),
+        bias("theta", 0.15), bias("v", 0.3), scale("v", 0.2), late("v", 0.1),
+        shape("drag_of_power_1.5", "v", ("quadratic_drag",), 0.9, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
+        outside("drag_in_turns", "v", 1.5, lambda v, s, t, k, x, u: -k["_k"] * v * u[..., 0] ** 2),
+        outside("wind", "v", 2.5, lambda v, s, t, k, x, u: k["_k"] * np.sin(x[..., 2] + 0.4)),
+        beat("v", 3.0, 0.9),
+    ],
+}  # fmt: skip
+
+_LEVEL: dict[str, tuple[frozenset[str], ...]] = {
+    "pendulum": (
+        frozenset({"constant_load@omega", "input_offset@u"}),
+        frozenset({"gravity_tilt@omega", "sensor_bias@phi"}),
+    ),
+    "cart": (frozenset({"constant_load@v", "input_offset@u", "sensor_bias@s"}),),
+    "tanks": (frozenset({"constant_inflow@h_1", "input_offset@u"}),),
+    "thermal": (
+        frozenset({"constant_inflow@T_1", "input_offset@u"}),
+        frozenset({"constant_inflow@T_2", "sensor_bias@T_2", "sensor_scale@T_2"}),
+    ),
+    "car": (frozenset({"constant_load@v", "input_offset@throttle"}),),
+}
+_ONE_SENSOR: dict[str, tuple[frozenset[str], ...]] = {
+    "pendulum": (frozenset({"input_delay@u", "sensor_delay@phi"}),),
+    "cart": (frozenset({"input_delay@u", "sensor_delay@s"}),),
+    "tanks": (frozenset({"input_delay@u", "sensor_delay@h_2"}),),
+    "thermal": (
+        frozenset(
+            {"constant_inflow@T_1", "input_offset@u", "constant_inflow@T_2", "sensor_bias@T_2", "sensor_scale@T_2"}
+        ),
+        frozenset({"input_delay@u", "sensor_delay@T_2"}),
+    ),
+}
+
+
+def twins(system: str, key: str, *, position_only: bool) -> list[str]:
+    """Return `name@place` of what no data of this system can tell from `key`.
+
+    A constant force is an offset of the motor (its gain is a parameter); a spring at rest elsewhere is a sensor's bias;
+    an angle sensor's bias is a tilt; two temperatures with free exchange rates take up every constant; where one sensor
+    reports everything, it is late as much as the input is.
+    """
+    groups = _LEVEL[system] + (_ONE_SENSOR.get(system, ()) if position_only else ())
+    return sorted({other for group in groups if key in group for other in group} - {key})
+
+
+def by_key(system: str, key: str) -> Effect:
+    """Find an effect of a system."""
+    return next(e for e in EFFECTS[system] if e.key == key)

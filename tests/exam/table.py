@@ -1,0 +1,169 @@
+"""The table of an exam: every figure of the design's bar table, for the tool and its rivals, with intervals.
+
+Reference: Clopper and Pearson (1934), The use of confidence or fiducial limits, 95 %.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.stats import beta
+
+from tests.exam.score import ERROR, FALSE, HEDGED, NOTHING, PART, RIGHT, TIE, TWIN, UNEXPLAINED, WRONG
+
+CLEAR = 10.0  # nats of the oracle: what should be found
+QUIET = 0.01  # noise up to which names must be exact
+HARMLESS = 1.02  # of the error before
+TOLD = ("simpel", "PySINDy", "BIC")
+COLUMN = {"simpel": "outcome", "PySINDy": "pysindy", "BIC": "bic"}
+OUTCOMES = (RIGHT, TIE, TWIN, PART, WRONG, HEDGED, NOTHING, UNEXPLAINED, FALSE, ERROR)
+
+
+class Bar(NamedTuple):
+    """A figure: of which sets, which outcomes count, and the bar that it is held against."""
+
+    figure: str
+    bar: str
+    of: Callable[[pd.DataFrame], pd.Series]
+    counts: tuple[str, ...]
+    least: float = 0.0
+    most: float = 1.0
+
+
+def _planted(t: pd.DataFrame) -> pd.Series:
+    return t.kind.isin(["one", "two"]) & (t.evidence >= CLEAR)
+
+
+def _single(t: pd.DataFrame) -> pd.Series:
+    return (t.kind == "one") & (t.evidence >= CLEAR)
+
+
+BARS = (
+    Bar("planted effect named exactly, noise <= 1 %, oracle >= 10 nats", ">= 98 %",
+        lambda t: _single(t) & (t.noise <= QUIET), (RIGHT,), least=0.98),
+    Bar("exact, or a tie that holds the truth, oracle >= 10 nats", ">= 97 %", _planted, (RIGHT, TIE), least=0.97),
+    Bar("wrong name, any condition", "<= 1 %", lambda t: t.kind != "none", (WRONG,), most=0.01),
+    Bar("effect claimed on data with none", "<= 1 %", lambda t: t.kind == "none", (FALSE,), most=0.01),
+    Bar("`none` said on data with none", "", lambda t: t.kind == "none", (RIGHT,)),
+    Bar("outside the library: unexplained, or with a remainder, >= 10 nats", ">= 90 %",
+        lambda t: (t.kind == "outside") & (t.evidence >= CLEAR), (RIGHT,), least=0.9),
+    Bar("two effects, both named, oracle >= 10 nats each", ">= 90 %",
+        lambda t: (t.kind == "two") & (t.evidence >= CLEAR), (RIGHT, TIE), least=0.9),
+    Bar("similar shape, nearest name or hedged, oracle >= 10 nats", "",
+        lambda t: (t.kind == "shape") & (t.evidence >= CLEAR), (RIGHT, TIE, HEDGED, UNEXPLAINED)),
+    Bar("the run failed", "0", lambda t: t.kind != "", (ERROR,), most=0.0),
+)  # fmt: skip
+
+
+def interval(k: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share."""
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return low, high
+
+
+def share(k: int, n: int) -> str:
+    """Write a share with its interval."""
+    if n == 0:
+        return "no sets"
+    low, high = interval(k, n)
+    return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f}..{100 * high:.0f})"
+
+
+def report(scores: pd.DataFrame) -> str:
+    """Return the whole report in Markdown."""
+    t = scores.reset_index(drop=True)
+    parts = [f"# Blind exam: {len(t)} sets\n", _markdown(_bars(t)), "\n## Conditions against full measurement\n"]
+    parts.append(_markdown(_against_full(t)))
+    parts += [f"\n## By {by}\n\n{_markdown(_split(t, by))}" for by in ("kind", "condition", "system", "noise", "world")]
+    failing = t[t.outcome.isin([WRONG, FALSE, ERROR, PART, HEDGED])]
+    if len(failing):
+        keys = ["index", "system", "condition", "noise", "planted", "outcome", "names", "evidence", "message"]
+        parts.append("\n## What went wrong\n\n" + _markdown(failing.reindex(columns=keys)))
+    return "\n".join(parts) + "\n"
+
+
+def _bars(t: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for bar in BARS:
+        row = {"figure": bar.figure, "bar": bar.bar}
+        of = t[bar.of(t)]
+        for name in TOLD:
+            row[name] = share(*_count(of, name, bar.counts)) if COLUMN[name] in t else "not installed"
+        k, n = _count(of, "simpel", bar.counts)
+        row["met"] = _met(k / n, bar.least, bar.most) if n and bar.bar else ""
+        rows.append(row)
+    return pd.DataFrame([*rows, *_numbers(t)]).fillna("")
+
+
+def _met(value: float, least: float, most: float) -> str:
+    return "yes" if least <= value <= most else "NO"
+
+
+def _count(of: pd.DataFrame, name: str, counts: tuple[str, ...]) -> tuple[int, int]:
+    return int(of[COLUMN[name]].isin(counts).sum()) if COLUMN[name] in of else 0, len(of)
+
+
+def _numbers(t: pd.DataFrame) -> list[dict[str, str]]:
+    """Rows that are no shares of outcomes: gain on held-out episodes, harm, coverage, time."""
+    clear = t[t.kind.isin(["one", "two"]) & (t.evidence >= CLEAR)]
+    gain = clear.get("of_oracle", pd.Series(dtype=float)).dropna().astype(float)
+    none = t[(t.kind == "none") & t.get("of_before", pd.Series(np.nan, t.index)).notna()]
+    safe = int((1 / none.of_before.astype(float) <= HARMLESS).sum()) if len(none) else 0
+    inside, counted = (int(t.get(n, pd.Series(0, t.index)).fillna(0).sum()) for n in ("covered", "intervals"))
+    small = t[t.system.isin(["pendulum", "cart"]) & t.get("seconds", pd.Series(np.nan, t.index)).notna()]
+    seconds = small.seconds.astype(float).median() if len(small) else float("nan")
+    spread = f"{gain.median():.3f} (n = {len(gain)}, tenth percentile {gain.quantile(0.1):.2f})"
+    return [
+        {"figure": "held-out 20-step error: the oracle's over ours, median", "bar": ">= 0.98",
+         "simpel": spread if len(gain) else "no sets",
+         "met": _met(gain.median(), 0.98, np.inf) if len(gain) else ""},
+        {"figure": "no harm where there is nothing to find (error at most 2 % up)", "bar": "100 %",
+         "simpel": share(safe, len(none)), "met": _met(safe / len(none), 1, 1) if len(none) else ""},
+        {"figure": "intervals of parameters and effects that cover (claimed: 90 %)", "bar": "86-96 %",
+         "simpel": share(inside, counted), "met": _met(inside / counted, 0.86, 0.96) if counted else ""},
+        {"figure": "seconds of a search, two states, median (compilation of the first included)", "bar": "<= 10 s",
+         "simpel": f"{seconds:.1f} s, {small.candidates.median():.0f} candidates" if len(small) else "no sets",
+         "met": _met(seconds, 0, 10) if len(small) else ""},
+    ]  # fmt: skip
+
+
+def _against_full(t: pd.DataFrame) -> pd.DataFrame:
+    """Exact or tie among clear sets, per condition; the bar is 5 points below full measurement."""
+    clear = t[_planted(t)]
+    right = clear.outcome.isin([RIGHT, TIE])
+    full = right[clear.condition == "full"].mean()
+    rows = []
+    for condition, part in clear.groupby("condition"):
+        k, n = int(right[part.index].sum()), len(part)
+        met = "" if condition == "full" or not np.isfinite(full) else _met(k / n, full - 0.05, 1)
+        rows.append({"condition": condition, "exact or tie": share(k, n), "within 5 points of full": met})
+    return pd.DataFrame(rows)
+
+
+def _split(t: pd.DataFrame, by: str) -> pd.DataFrame:
+    rows = []
+    for value, part in t.groupby(by):
+        clear, none = part[_planted(part)], part[part.kind == "none"]
+        row = {by: value, "sets": len(part), "exact, clear": share(*_count(clear, "simpel", (RIGHT,)))}
+        row["wrong"] = share(*_count(part[part.kind != "none"], "simpel", (WRONG,)))
+        row["false effect"] = share(*_count(none, "simpel", (FALSE,)))
+        rows.append(row | {name: int((part.outcome == name).sum()) for name in OUTCOMES})
+    return pd.DataFrame(rows)
+
+
+def _markdown(frame: pd.DataFrame) -> str:
+    """Write a table; pandas' own needs another package."""
+    if frame.empty:
+        return "no sets"
+    text = [[_cell(v) for v in row] for row in frame.itertuples(index=False)]
+    head = [str(c) for c in frame.columns]
+    lines = [head, ["---"] * len(head), *text]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return "" if np.isnan(value) else f"{value:.4g}"
+    return str(value).replace("|", "/").replace("\n", " ")

@@ -1,0 +1,353 @@
+"""The blind exam itself: its data obey physics that others derived, its truth stays hidden, its scores say what they should."""
+
+import ast
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from command_line import CACHE
+from scipy.linalg import expm
+
+from simulators.model import Declared
+from tests.exam import mujoco_plants, rivals, score, table, tool
+from tests.exam.draw import CLOSED, FULL, NONE, ONE, SHARE_OF_CONDITION, Set, draw, possible
+from tests.exam.examine import places
+from tests.exam.integrate import simulate
+from tests.exam.planted import ABSORBED, EFFECTS, LATE_SENSOR, by_key, twins
+from tests.exam.plants import SYSTEMS
+from tests.exam.record import plant, record
+from tests.exam.write import write
+
+EXAM = Path(__file__).parent / "exam"
+GENERATOR = ("plants", "planted", "integrate", "mujoco_plants", "draw", "record", "visible", "write")
+QUIET = 1e-9  # of noise
+
+
+def one(
+    system: str, key: str = "", *, strength: float = 1.0, condition: str = FULL, noise: float = 0.01, world: str = "own"
+) -> Set:
+    planted = (key,) if key else ()
+    return Set(7, system, ONE if key else NONE, planted, (strength,) * len(planted), noise, condition, world, 11)
+
+
+def imported(name: str) -> set[str]:
+    tree = ast.parse((EXAM / f"{name}.py").read_text())
+    found = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            found |= {
+                f"{node.module}.{a.name}" if node.module == "tests.exam" else str(node.module) for a in node.names
+            }
+    return found
+
+
+def test_the_generator_knows_nothing_of_the_tool() -> None:
+    assert "simpel_cli.main" in imported("tool")  # the check sees imports inside functions
+    for name in GENERATOR:
+        modules = imported(name)
+        assert "numpy" in modules or "tests.exam.plants" in modules
+        assert not {m for m in modules if m.split(".")[0] in ("simpel_cli", "simulators")}, name
+        assert {m.split(".")[2] for m in modules if m.startswith("tests.exam.")} <= set(GENERATOR)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_tool_gets_the_same_equations_and_ranges(name: str) -> None:
+    system, random = SYSTEMS[name], np.random.default_rng(0)
+    node = yaml.safe_load((EXAM / "nominal" / f"{name}.yaml").read_text())
+    node.pop("_target_")
+    model = Declared(**node).model()
+    assert tuple(q.name for q in model.states) == system.states
+    assert tuple(q.name for q in model.inputs) == system.inputs
+    assert {q.name: (q.low, q.high) for q in model.params} == system.ranges
+    assert model.dt == system.dt
+    assert [(q.low, q.high) for q in model.inputs] == list(system.limits)
+    for x in system.start(random, 5):
+        u, p = random.uniform(*np.array(system.limits).T), system.parameters(random)
+        theirs = np.asarray(model.function()(x, u, list(p.values()))[0]).ravel()
+        np.testing.assert_allclose(system.rate(x, u, p), theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_the_integrator_has_order_four() -> None:
+    system = SYSTEMS["pendulum"]
+    p = {"m": 1.0, "l": 1.0, "C_m": 1.0}
+
+    def end(fine: int) -> np.ndarray:
+        rate = lambda x, u, t: system.rate(x, u, p)  # noqa: E731
+        start, commands = np.array([[1.0, 0.5], [-2.0, 0.0]]), np.ones((2, 11, 1))
+        return simulate(rate, start, commands, 0.1, fine=fine)[0][:, -1]
+
+    exact = end(64)
+    errors = [np.abs(end(fine) - exact).max() for fine in (2, 4, 8)]
+    assert errors[0] > 1e-7
+    assert all(13 < a / b < 19 for a, b in itertools.pairwise(errors))
+
+
+@pytest.mark.parametrize("lag", [0.03, 0.0007])
+def test_late_and_lagging_commands_and_late_records_agree_with_the_matrix_exponential(lag: float) -> None:
+    dt, delay, tap = 0.04, 0.057, 0.013
+    p = {"M": 1.4, "K": 60.0, "K_m": 4.0, "b": 2.0}
+    commands = np.array([1.0, -2.0, 0.5, 3.0, 3.0, -1.0])[None, :, None]
+    rate = lambda x, u, t: SYSTEMS["cart"].rate(x, u, p)  # noqa: E731
+    start = np.array([[0.1, -0.2]])
+    states, tapped, _ = simulate(rate, start, commands, dt, delay=[delay], lag=[lag], tap=tap)
+    # states s, v, what the motor delivers, and the command on its way
+    A = np.array([[0, 1, 0, 0], [-60 / 1.4, -2 / 1.4, 4 / 1.4, 0], [0, 0, -1 / lag, 1 / lag], [0, 0, 0, 0.0]])
+
+    def exact(t: float) -> np.ndarray:
+        y, now = np.array([0.1, -0.2, 1.0, 1.0]), 0.0
+        for k, command in enumerate(commands[0, :, 0]):
+            arrives = k * dt + delay
+            if k and arrives < t:
+                y, now = expm(A * (arrives - now)) @ y, arrives
+                y[3] = command
+        return (expm(A * (t - now)) @ y)[:2]
+
+    for row in range(6):
+        np.testing.assert_allclose(states[0, row], exact(row * dt), atol=5e-7)
+        np.testing.assert_allclose(tapped[0, row], exact(row * dt + tap), atol=5e-7)
+    assert np.abs(states[0, 4] - states[0, 3]).max() > 0.01
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_every_effect_is_recorded_and_shows(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.exam.record.ROWS", 20)  # a third of a set, for speed
+    without = record(one(system, noise=QUIET)).measured
+    assert np.isfinite(without).all()
+    assert EFFECTS[system]
+    for effect in EFFECTS[system]:
+        made = record(one(system, effect.key, noise=QUIET))
+        assert np.isfinite(made.measured).all(), effect.key
+        assert np.abs(made.measured - without).max() > 1e-3 * without.std(), effect.key
+        # nothing else was changed: with no strength the effect is not there
+        none = record(one(system, effect.key, noise=QUIET, strength=1e-12)).measured
+        np.testing.assert_allclose(none, without, atol=1e-5 * np.abs(without).max(), err_msg=effect.key)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("condition", SHARE_OF_CONDITION)
+def test_every_condition_is_recorded(system: str, condition: str, tmp_path: Path) -> None:
+    effect = next(e for e in EFFECTS[system] if e.group == "one")
+    if not possible(system, condition, (effect,)):
+        assert condition == "derived velocity"
+        return
+    drawn = one(system, effect.key, condition=condition)
+    folder, file = places(tmp_path, 0)
+    write(drawn, folder, file)
+    frame = pd.read_parquet(folder / "data" / "run.parquet")
+    assert set(frame.split) == {"train", "test"}
+    assert set(drawn.measured) <= set(frame.columns)
+    assert np.isfinite(frame[list(drawn.measured)]).to_numpy().all()
+    made, plain = record(drawn), record(one(system, effect.key))
+    for j, (low, high) in enumerate(SYSTEMS[system].limits):
+        assert low <= made.commands[..., j].min() < made.commands[..., j].max() <= high
+    changed = np.abs(made.commands - plain.commands).max() > 0
+    assert changed == (condition == CLOSED)
+    if condition != FULL and condition != "position only":
+        assert np.abs(made.measured - plain.measured).max() > 0
+    told = json.loads(file.read_text())
+    assert told["effects"][0]["name"] == effect.name
+    words = "".join(p.read_bytes().decode(errors="replace") for p in folder.rglob("*") if p.is_file())
+    assert effect.name not in words
+    assert not any(name in words for name in ("truth", "planted", "strength"))
+
+
+def test_the_truth_is_not_written_where_the_tool_looks(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="inside the folder"):
+        write(one("cart"), tmp_path / "set", tmp_path / "set" / "truth.json")
+
+
+@pytest.mark.parametrize(("system", "effect"), [(s, e) for s, names in mujoco_plants.WORLDS.items() for e in names])
+def test_mujoco_and_the_own_plant_tell_the_same(system: str, effect: str) -> None:
+    key = next(e.key for e in EFFECTS[system] if e.name == effect and e.group == "one")
+    start = {"noise": QUIET, "strength": 0.3}
+    own, theirs = (record(one(system, key, world=w, **start)).clean[:, :16] for w in ("own", "mujoco"))
+    without = record(one(system, noise=QUIET)).clean[:, :16]
+    size = np.abs(own - without).max()
+    assert size > 1e-3
+    assert np.abs(own - theirs).max() < 0.12 * size  # they differ: another law of contact, soft friction
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_constant_force_is_an_offset_of_the_motor(system: str) -> None:
+    told = SYSTEMS[system]
+    pairs = [(e.key, t) for e in EFFECTS[system] for t in twins(system, e.key, position_only=False)]
+    key, other = next((k, t) for k, t in pairs if k.startswith(("constant_",)) and t.startswith("input_offset"))
+    p = told.parameters(np.random.default_rng(3))
+    constant, offset = by_key(system, key), next((e for e in EFFECTS[system] if e.key == other), None)
+    if offset is None:  # the tool may name it; the exam does not plant it
+        offset = by_key("pendulum", "input_offset@u")._replace(acts_on=other.split("@")[1])
+    i, j = told.states.index(constant.acts_on), told.inputs.index(offset.acts_on)
+    x = told.start(np.random.default_rng(4), 4)
+    u = np.full((4, len(told.inputs)), 0.4)
+    unit = np.eye(len(told.inputs))[j]
+    gain = (told.rate(x, u + unit, p) - told.rate(x, u, p))[:, i]
+    force = plant(told, p, (constant,), ({"c": float(0.1 * gain[0])},))(x, u, 0.0)
+    moved = plant(told, p, (offset,), ({"b": 0.1},))(x, u, 0.0)
+    np.testing.assert_allclose(force, moved, rtol=1e-10)
+    assert np.abs(force - told.rate(x, u, p)).max() > 0
+
+
+def test_draws_keep_the_shares() -> None:
+    sets = [draw(i, 5) for i in range(600)]
+    assert sets[:3] == [draw(i, 5) for i in range(3)]
+    frame = pd.DataFrame([d._asdict() for d in sets])
+    assert (frame.kind == NONE).mean() >= 0.3
+    assert set(frame.system) == set(SYSTEMS)
+    assert set(frame.condition) == set(SHARE_OF_CONDITION)
+    assert {"none", "one", "two", "shape", "outside"} == set(frame.kind)
+    assert (frame.world == "mujoco").sum() > 30
+    strengths = np.log10([d.strength[0] for d in sets if d.kind == ONE])
+    assert -2 <= strengths.min() < -1.9
+    assert abs(strengths.mean() + 1) < 4 * 2 / np.sqrt(
+        12 * len(strengths)
+    )  # uniform: mean -1, within 4 standard errors
+    assert not any(e.group == ABSORBED for d in sets if d.kind != NONE for e in d.effects)
+    assert not any(e.kind == LATE_SENSOR for d in sets if d.condition == CLOSED for e in d.effects)
+    named = {d.planted[0].split("@")[0] for d in sets if d.kind == ONE}
+    assert len(named) >= 25
+
+
+def verdict(*effects: dict[str, Any], kind: str = "effect", remainder: Any = None) -> dict[str, Any]:
+    return {"verdict": kind, "effects": list(effects), "remainder": remainder}
+
+
+def claim(*names: str, on: str = "v", same_as: tuple[str, ...] = ()) -> dict[str, Any]:
+    return {
+        "name": names[0], "acts_on": on, "class": list(names), "class_acts_on": dict.fromkeys(names, on),
+        "same_as": list(same_as), "log_evidence_gain": 20.0,
+    }  # fmt: skip
+
+
+def planted(name: str, on: str = "v", **more: Any) -> dict[str, Any]:
+    return {"name": name, "acts_on": on, "accept": [name], "twins": [], "parameters": {}, "strength": 1.0} | more
+
+
+COULOMB, DELAY = planted("coulomb_friction"), planted("input_delay", "u")
+LOAD = planted("constant_load", twins=["input_offset@u"])
+DRAG = planted("drag", accept=["quadratic_drag", "viscous_friction"])
+OFFSET = claim("input_offset", on="u")
+EITHER = claim("constant_load", "input_offset") | {"class_acts_on": {"constant_load": "v", "input_offset": "u"}}
+LEFT = {"acts_on": "v", "depends_on": ["v"]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "effects", "found", "expected"),
+    [
+        ("none", [], verdict(kind="none"), "right"),
+        ("none", [], verdict(kind="unexplained"), "unexplained"),
+        ("none", [], verdict(claim("coulomb_friction"), remainder=LEFT), "false effect"),
+        ("one", [COULOMB], verdict(claim("coulomb_friction")), "right"),
+        ("one", [COULOMB], verdict(claim("coulomb_friction", on="w")), "wrong"),
+        ("one", [COULOMB], verdict(claim("stribeck_friction")), "wrong"),
+        ("one", [COULOMB], verdict(claim("stribeck_friction", "coulomb_friction")), "tie"),
+        ("one", [COULOMB], verdict(claim("coulomb_friction"), claim("input_delay", on="u")), "wrong"),
+        ("one", [COULOMB], verdict(kind="none"), "nothing"),
+        ("one", [COULOMB], verdict(kind="unexplained", remainder=LEFT), "unexplained"),
+        ("one", [LOAD], verdict(OFFSET), "twin"),
+        ("one", [LOAD], verdict(EITHER), "right"),
+        ("one", [COULOMB], verdict(OFFSET), "wrong"),
+        ("one", [planted("gravity_tilt")], verdict(claim("sensor_bias", on="phi", same_as=("gravity_tilt",))), "right"),
+        ("two", [COULOMB, DELAY], verdict(claim("input_delay", on="u"), claim("coulomb_friction")), "right"),
+        ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction")), "part"),
+        ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("leak")), "wrong"),
+        ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("input_delay", "input_lag", on="u")), "tie"),
+        ("shape", [DRAG], verdict(claim("quadratic_drag"), claim("viscous_friction")), "right"),
+        ("shape", [DRAG], verdict(claim("end_stop"), remainder=LEFT), "hedged"),
+        ("shape", [DRAG], verdict(claim("end_stop")), "wrong"),
+        ("outside", [planted("wind")], verdict(kind="unexplained", remainder=LEFT), "right"),
+        ("outside", [planted("wind")], verdict(claim("cogging"), remainder=LEFT), "right"),
+        ("outside", [planted("wind")], verdict(claim("cogging")), "wrong"),
+        ("outside", [planted("wind")], verdict(kind="none"), "nothing"),
+    ],
+)  # fmt: skip
+def test_outcomes(kind: str, effects: list[dict[str, Any]], found: dict[str, Any], expected: str) -> None:
+    assert score.outcome({"kind": kind, "effects": effects}, found) == expected
+
+
+@pytest.mark.parametrize(("more", "expected"), [(2.0, "tie"), (9.0, "wrong")])
+def test_a_special_case_is_no_error_while_the_data_ask_for_no_more(more: float, expected: str) -> None:
+    gains = {("coulomb_friction", "v"): 50.0, ("stribeck_friction", "v"): 50.0 + more}
+    truth = {"kind": "one", "effects": [planted("stribeck_friction")]}
+    assert score.outcome(truth, verdict(claim("coulomb_friction")), gains) == expected
+
+
+def test_coverage_counts_what_the_data_determine() -> None:
+    truth = {
+        "kind": "one", "world": "own", "effects": [planted("coulomb_friction", parameters={"tau_c": 0.4})],
+        "parameters": {n: {"value": 1.0, "range": [0.0, 2.0]} for n in ("inside", "beside", "open")},
+    }  # fmt: skip
+    ends = {"inside": (0.9, 1.1), "beside": (1.1, 1.2), "open": (0.2, 1.9)}
+    found = verdict(claim("coulomb_friction") | {"parameters": {"tau_c": {"low": 0.3, "high": 0.5}}})
+    found["parameters"] = {n: {"after": {"low": a, "high": b}} for n, (a, b) in ends.items()}
+    assert score.covered(truth, "right", found) == (2, 3)
+    assert score.covered(truth, "wrong", found) == (0, 0)
+
+
+def test_errors_are_compared_over_channels() -> None:
+    mine = {"error": {"after": {"horizon": {"s": 1.0, "v": 4.0}}, "before": {"horizon": {"s": 2.0, "v": 18.0}}}}
+    assert score.error_ratio(mine, mine, "before") == pytest.approx(3.0)
+    assert score.error_ratio(mine, None) == pytest.approx(1.0)
+
+
+def test_intervals_are_clopper_and_pearsons() -> None:
+    assert table.interval(0, 349) == (0.0, pytest.approx(1 - 0.025 ** (1 / 349)))
+    assert table.interval(10, 10) == (pytest.approx(0.025**0.1), 1.0)
+    assert table.interval(5, 10)[0] == pytest.approx(1 - table.interval(5, 10)[1])
+
+
+def test_the_table_has_every_bar_and_tells_what_is_missed() -> None:
+    rows = [
+        {
+            "index": i, "system": "cart", "kind": ("one", "none")[i % 2], "condition": "full", "noise": 0.01, "world": "own",
+            "planted": "", "outcome": ("right", "right", "wrong", "false effect")[i % 4], "names": "", "evidence": 50.0,
+            "bic": "wrong", "of_oracle": 1.0, "of_before": 1.0, "covered": 9, "intervals": 10, "seconds": 3.0,
+            "candidates": 20, "message": "",
+        }
+        for i in range(40)
+    ]  # fmt: skip
+    text = table.report(pd.DataFrame(rows))
+    lines = {line.split(" | ")[0].removeprefix("| "): line for line in text.splitlines()}
+    exact = lines["planted effect named exactly, noise <= 1 %, oracle >= 10 nats"]
+    assert "10/20 = 50.0 % (27..73)" in exact
+    assert "not installed" in exact
+    assert exact.endswith("NO |")
+    assert "10/20" in lines["effect claimed on data with none"]
+    assert lines["intervals of parameters and effects that cover (claimed: 90 %)"].endswith("yes |")
+    assert "no sets" in lines["two effects, both named, oracle >= 10 nats each"]
+    assert all(bar.figure in lines for bar in table.BARS)
+
+
+def test_the_forward_search_names_what_a_regression_can_see(tmp_path: Path) -> None:
+    folder, file = places(tmp_path, 0)
+    write(one("pendulum", "viscous_friction@omega", noise=1e-4), folder, file)
+    truth = json.loads(file.read_text())
+    made = rivals.problem(folder, "pendulum", truth["measured"])
+    assert ("viscous_friction", "omega") in rivals.forward(made)
+    target, columns, more = made["omega"]
+    added = next(c.values for c in more if c.effect == "viscous_friction")
+    fit = np.linalg.lstsq(np.column_stack([columns, added]), target, rcond=None)[0]
+    assert fit[-1] == pytest.approx(-truth["effects"][0]["parameters"]["b"], rel=0.05)
+
+
+def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(CACHE))
+    folder, file = places(tmp_path, 0)
+    write(one("cart", "coulomb_friction@v", strength=0.5), folder, file)
+    few = ("coulomb_friction", "quadratic_drag", "constant_load", "input_delay")
+    answer = tool.discover(folder, "run", few)
+    assert not answer.error
+    found = json.loads((answer.directory / "verdict.json").read_text())
+    truth = json.loads(file.read_text())
+    assert score.outcome(truth, found) == "right"
+    inside, counted = score.covered(truth, "right", found)
+    assert counted >= 3
+    assert inside >= 1
+    assert tool.discover(folder, "run", few).wall != answer.wall  # what was run is not run again
+    (folder / "sim" / "rig.yaml").write_text("_target_: simulators.model.Declared\nname: broken\n")
+    assert "ConfigError" in tool.discover(folder, "other").error
