@@ -46,7 +46,7 @@ format: install ## Format the code
 bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
 
-exam: install ## Give `simpel discover` the blind exam (SETS=600)
+exam: install ## Give `simpel discover` the blind exam (SETS=600; PySINDy beside it after: uv sync --group exam)
 	$(BIN)/python -m tests.exam --sets $(SETS) --out runs/exam/$$(date +%Y%m%d-%H%M%S)
 
 reproduce-metrics_vs_n_train: install ## Make the README's figure anew (36 fits)

@@ -45,7 +45,7 @@ def _scored(truth: dict[str, Any], folder: Path) -> dict[str, Any]:
     gains = {(e, p): float(g) for e, p, g in zip(tried.effect, tried.acts_on, tried.log_evidence_gain, strict=True)}
     graded = score.outcome(truth, found, gains)
     oracle = None
-    if score.needs_oracle(truth, graded):
+    if score.needs_oracle(truth, graded, gains):
         asked = discover(folder, ORACLE, score.names(truth))
         oracle = None if asked.error else json.loads((asked.directory / "verdict.json").read_text())
     inside, counted = score.covered(truth, graded, found)

@@ -14,6 +14,7 @@ from tests.exam.plants import AMBIENT, SYSTEMS
 MERGED = {  # columns that together are one effect of the catalogue
     frozenset({"coulomb_friction", "stribeck_friction"}): "stribeck_friction",
     frozenset({"coulomb_friction", "asymmetric_friction"}): "asymmetric_friction",
+    frozenset({"coulomb_friction", "constant_load"}): "asymmetric_friction",
     frozenset({"leak", "constant_inflow"}): "ambient_exchange",
 }
 

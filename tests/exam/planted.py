@@ -9,6 +9,30 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.exam.formulas import (
+    asymmetric,
+    beyond,
+    cogging,
+    constant,
+    coulomb,
+    coupling,
+    crowding,
+    cubic,
+    exchange,
+    inertia,
+    leak,
+    outflow,
+    overflow,
+    quadratic,
+    ramp,
+    spring,
+    stop,
+    stribeck,
+    swing,
+    tilt,
+    viscous,
+)
+
 RATE, INPUT, SENSOR, DELAY, LAG, LATE_SENSOR = "rate", "input", "sensor", "delay", "lag", "late sensor"
 ONE, SHAPE, OUTSIDE, ABSORBED = "one", "shape", "outside", "absorbed"
 
@@ -55,103 +79,17 @@ class Effect(NamedTuple):
         )
 
 
-def ramp(v: np.ndarray, width: float) -> np.ndarray:
-    """Sign of a speed, linear below `width`."""
-    return np.clip(v / width, -1.0, 1.0)
-
-
-def _beyond(value: np.ndarray, limit: float) -> np.ndarray:
-    return value - np.clip(value, -limit, limit)
-
-
-def _viscous(v, s, t, k, x, u):
-    return -k["b"] * v
-
-
-def _coulomb(v, s, t, k, x, u):
-    return -k["tau_c"] * ramp(v, k["_width"])
-
-
-def _stribeck(v, s, t, k, x, u):
-    return -(k["tau_c"] + k["tau_s"] * np.exp(-((v / k["v_s"]) ** 2))) * ramp(v, k["_width"])
-
-
-def _asymmetric(v, s, t, k, x, u):
-    side = ramp(v, k["_width"])
-    return np.where(v > 0, -k["tau_p"] * side, -k["tau_n"] * side)
-
-
-def _quadratic(v, s, t, k, x, u):
-    return -k["c"] * v * np.abs(v)
-
-
-def _constant(v, s, t, k, x, u):
-    return np.full_like(v, k["c"])
-
-
-def _spring(v, s, t, k, x, u):
-    return -k["k"] * s
-
-
-def _cubic(v, s, t, k, x, u):
-    return -k["k_3"] * s**3
-
-
-def _stop(v, s, t, k, x, u):
-    return -k["k"] * _beyond(s, k["s_max"])
-
-
-def _cogging(v, s, t, k, x, u):
-    return k["a"] * np.sin(k["n"] * s) + k["b"] * np.cos(k["n"] * s)
-
-
-def _tilt(v, s, t, k, x, u):
-    return k["a"] * np.cos(s)
-
-
-def _leak(v, s, t, k, x, u):
-    return -k["k"] * v
-
-
-def _outflow(v, s, t, k, x, u):
-    return -k["k"] * np.maximum(v, 0.0) ** k["n"]
-
-
-def _overflow(v, s, t, k, x, u):
-    return -k["k"] * np.maximum(v - k["x_max"], 0.0)
-
-
-def _exchange(v, s, t, k, x, u):
-    return k["k"] * (k["x_a"] - v)
-
-
-def _crowding(v, s, t, k, x, u):
-    return -k["k"] * v**2
-
-
-def _coupling(v, s, t, k, x, u):
-    return k["k"] * (s - v)
-
-
-def _beat(v, s, t, k, x, u):
-    return np.full_like(v, k["_force"] * np.sin(2 * np.pi * t / k["_period"] + k["_phase"]))
-
-
-def _inertia(v, s, t, k, x, u):
-    raise NotImplementedError("scales the whole rate: see record.plant")
-
-
 def friction(place: str, tau: float, width: float, v_s: float) -> list[Effect]:
     """Dry friction of three kinds; tau is its acceleration at full strength."""
     return [
-        Effect("coulomb_friction", place, RATE, {"tau_c": tau, "_width": width}, ("tau_c",), _coulomb),
+        Effect("coulomb_friction", place, RATE, {"tau_c": tau, "_width": width}, ("tau_c",), coulomb),
         Effect(
             "stribeck_friction", place, RATE, {"tau_c": 0.6 * tau, "tau_s": tau, "v_s": v_s, "_width": width},
-            ("tau_c", "tau_s"), _stribeck,
+            ("tau_c", "tau_s"), stribeck,
         ),
         Effect(
             "asymmetric_friction", place, RATE, {"tau_p": tau, "tau_n": 0.25 * tau, "_width": width},
-            ("tau_p", "tau_n"), _asymmetric,
+            ("tau_p", "tau_n"), asymmetric,
         ),
     ]  # fmt: skip
 
@@ -173,7 +111,7 @@ def commands(place: str, largest: float, delay: float, lag: float, *, signed: bo
         return found
     return [
         *found,
-        Effect("input_dead_zone", place, INPUT, {"d": 0.33 * largest}, ("d",), lambda u, k: _beyond(u, k["d"])),
+        Effect("input_dead_zone", place, INPUT, {"d": 0.33 * largest}, ("d",), lambda u, k: beyond(u, k["d"])),
         Effect("input_gain_asymmetry", place, INPUT, {"a": 0.4}, ("a",), lambda u, k: u + k["a"] * np.abs(u)),
         Effect("input_offset", place, INPUT, {"b": 0.3 * largest}, ("b",), lambda u, k: u + k["b"]),
         Effect(
@@ -216,7 +154,13 @@ def outside(name: str, place: str, size: float, formula: Formula) -> Effect:
 def beat(place: str, size: float, period: float) -> Effect:
     """A force that swings with time, whatever the state does."""
     return Effect(
-        "periodic_force", place, RATE, {"_force": size, "_period": period, "_phase": 0.7}, ("_force",), _beat, OUTSIDE
+        "periodic_force",
+        place,
+        RATE,
+        {"_force": size, "_period": period, "_phase": 0.7},
+        ("_force",),
+        swing,
+        OUTSIDE,
     )
 
 
@@ -224,12 +168,12 @@ _DRAG = ("quadratic_drag", "viscous_friction")
 
 EFFECTS: dict[str, list[Effect]] = {
     "pendulum": [
-        rate("viscous_friction", "omega", _viscous, "b", b=0.8), *friction("omega", 2.0, 0.01, 0.8),
-        rate("quadratic_drag", "omega", _quadratic, "c", c=0.3), rate("constant_load", "omega", _constant, "c", c=2.0),
-        rate("linear_stiffness", "omega", _spring, "k", k=3.0), rate("cubic_stiffness", "omega", _cubic, "k_3", k_3=0.6),
-        Effect("cogging", "omega", RATE, {"a": 1.0, "b": 1.0, "n": 4.0}, ("a", "b"), _cogging),
-        rate("gravity_tilt", "omega", _tilt, "a", a=1.5),
-        Effect("added_inertia", "omega", RATE, {"alpha": 0.6}, ("alpha",), _inertia),
+        rate("viscous_friction", "omega", viscous, "b", b=0.8), *friction("omega", 2.0, 0.01, 0.8),
+        rate("quadratic_drag", "omega", quadratic, "c", c=0.3), rate("constant_load", "omega", constant, "c", c=2.0),
+        rate("linear_stiffness", "omega", spring, "k", k=3.0), rate("cubic_stiffness", "omega", cubic, "k_3", k_3=0.6),
+        Effect("cogging", "omega", RATE, {"a": 1.0, "b": 1.0, "n": 4.0}, ("a", "b"), cogging),
+        rate("gravity_tilt", "omega", tilt, "a", a=1.5),
+        Effect("added_inertia", "omega", RATE, {"alpha": 0.6}, ("alpha",), inertia),
         *commands("u", 2.5, 0.12, 0.15), bias("phi", 0.15), scale("omega", 0.25), late("omega", 0.08),
         shape("wide_ramp_friction", "omega", ("coulomb_friction",), 2.0, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.3)),
         shape("drag_of_power_1.5", "omega", _DRAG, 0.5, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
@@ -238,12 +182,12 @@ EFFECTS: dict[str, list[Effect]] = {
         beat("omega", 3.0, 1.1),
     ],
     "cart": [
-        *friction("v", 1.5, 0.003, 0.25), rate("quadratic_drag", "v", _quadratic, "c", c=3.0),
-        rate("constant_load", "v", _constant, "c", c=2.0), rate("cubic_stiffness", "v", _cubic, "k_3", k_3=600.0),
-        rate("end_stop", "v", _stop, "k", k=300.0, s_max=0.13),
-        Effect("viscous_friction", "v", RATE, {"b": 0.4}, ("b",), _viscous, ABSORBED),
-        Effect("linear_stiffness", "v", RATE, {"k": 3.0}, ("k",), _spring, ABSORBED),
-        Effect("added_inertia", "v", RATE, {"alpha": 0.07}, ("alpha",), _inertia, ABSORBED),
+        *friction("v", 1.5, 0.003, 0.25), rate("quadratic_drag", "v", quadratic, "c", c=3.0),
+        rate("constant_load", "v", constant, "c", c=2.0), rate("cubic_stiffness", "v", cubic, "k_3", k_3=600.0),
+        rate("end_stop", "v", stop, "k", k=300.0, s_max=0.13),
+        Effect("viscous_friction", "v", RATE, {"b": 0.4}, ("b",), viscous, ABSORBED),
+        Effect("linear_stiffness", "v", RATE, {"k": 3.0}, ("k",), spring, ABSORBED),
+        Effect("added_inertia", "v", RATE, {"alpha": 0.07}, ("alpha",), inertia, ABSORBED),
         *commands("u", 3.0, 0.1, 0.12), bias("s", 0.03), scale("v", 0.25), late("v", 0.06),
         shape("wide_ramp_friction", "v", ("coulomb_friction",), 1.5, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.06)),
         shape("drag_of_power_1.5", "v", ("quadratic_drag",), 3.0, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
@@ -253,12 +197,12 @@ EFFECTS: dict[str, list[Effect]] = {
         beat("v", 3.0, 0.7),
     ],
     "tanks": [
-        rate("leak", "h_1", _leak, "k", k=0.02), rate("leak", "h_2", _leak, "k", k=0.02),
-        rate("outflow_exponent", "h_2", _outflow, "k", k=0.004, n=1.5),
-        rate("overflow", "h_1", _overflow, "k", k=0.2, x_max=38.0), rate("overflow", "h_2", _overflow, "k", k=0.2, x_max=20.0),
-        rate("ambient_exchange", "h_2", _exchange, "k", k=0.04, x_a=30.0),
-        rate("constant_inflow", "h_1", _constant, "c", c=0.6), rate("constant_inflow", "h_2", _constant, "c", c=0.6),
-        rate("crowding", "h_1", _crowding, "k", k=4e-4),
+        rate("leak", "h_1", leak, "k", k=0.02), rate("leak", "h_2", leak, "k", k=0.02),
+        rate("outflow_exponent", "h_2", outflow, "k", k=0.004, n=1.5),
+        rate("overflow", "h_1", overflow, "k", k=0.2, x_max=38.0), rate("overflow", "h_2", overflow, "k", k=0.2, x_max=20.0),
+        rate("ambient_exchange", "h_2", exchange, "k", k=0.04, x_a=30.0),
+        rate("constant_inflow", "h_1", constant, "c", c=0.6), rate("constant_inflow", "h_2", constant, "c", c=0.6),
+        rate("crowding", "h_1", crowding, "k", k=4e-4),
         *commands("u", 6.0, 10.0, 12.0, signed=False), bias("h_2", 3.0), scale("h_2", 0.15), late("h_1", 8.0),
         shape("weir", "h_1", ("overflow",), 0.06, lambda v, s, t, k, x, u: -k["_k"] * np.maximum(v - 35.0, 0.0) ** 1.5),
         shape("outflow_of_power_0.8", "h_2", ("outflow_exponent", "leak"), 0.06,
@@ -267,11 +211,11 @@ EFFECTS: dict[str, list[Effect]] = {
         beat("h_2", 0.6, 60.0),
     ],
     "thermal": [
-        rate("thermal_coupling", "T_1", _coupling, "k", k=0.008), rate("constant_inflow", "T_1", _constant, "c", c=0.12),
-        rate("constant_inflow", "T_2", _constant, "c", c=0.12), rate("crowding", "T_1", _crowding, "k", k=1e-4),
-        rate("overflow", "T_1", _overflow, "k", k=0.03, x_max=42.0),
+        rate("thermal_coupling", "T_1", coupling, "k", k=0.008), rate("constant_inflow", "T_1", constant, "c", c=0.12),
+        rate("constant_inflow", "T_2", constant, "c", c=0.12), rate("crowding", "T_1", crowding, "k", k=1e-4),
+        rate("overflow", "T_1", overflow, "k", k=0.03, x_max=42.0),
         *commands("u", 1.0, 30.0, 40.0, signed=False), bias("T_2", 4.0), scale("T_1", 0.15), late("T_1", 20.0),
-        Effect("input_dead_zone", "u", INPUT, {"d": 0.3}, ("d",), lambda u, k: _beyond(u, k["d"])),
+        Effect("input_dead_zone", "u", INPUT, {"d": 0.3}, ("d",), lambda u, k: beyond(u, k["d"])),
         Effect("input_offset", "u", INPUT, {"b": 0.3}, ("b",), lambda u, k: u + k["b"]),
         shape("radiation", "T_1", ("crowding",), 0.25, lambda v, s, t, k, x, u: -k["_k"] * (((v + 273) / 320) ** 4 - 0.7)),
         outside("product_of_temperatures", "T_2", 1.5e-4, lambda v, s, t, k, x, u: -k["_k"] * (v - 20) * (s - 20)),
@@ -279,9 +223,9 @@ EFFECTS: dict[str, list[Effect]] = {
         beat("T_1", 0.25, 140.0),
     ],
     "car": [
-        *friction("v", 2.0, 0.02, 0.6), rate("quadratic_drag", "v", _quadratic, "c", c=0.5),
-        rate("constant_load", "v", _constant, "c", c=1.5),
-        Effect("viscous_friction", "v", RATE, {"b": 0.15}, ("b",), _viscous, ABSORBED),
+        *friction("v", 2.0, 0.02, 0.6), rate("quadratic_drag", "v", quadratic, "c", c=0.5),
+        rate("constant_load", "v", constant, "c", c=1.5),
+        Effect("viscous_friction", "v", RATE, {"b": 0.15}, ("b",), viscous, ABSORBED),
         *commands("steer", 1.0, 0.15, 0.2), *commands("throttle", 1.0, 0.15, 0.2),
         bias("theta", 0.15), bias("v", 0.3), scale("v", 0.2), late("v", 0.1),
         shape("drag_of_power_1.5", "v", ("quadratic_drag",), 0.9, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
@@ -290,42 +234,6 @@ EFFECTS: dict[str, list[Effect]] = {
         beat("v", 3.0, 0.9),
     ],
 }  # fmt: skip
-
-_LEVEL: dict[str, tuple[frozenset[str], ...]] = {
-    "pendulum": (
-        frozenset({"constant_load@omega", "input_offset@u"}),
-        frozenset({"gravity_tilt@omega", "sensor_bias@phi"}),
-    ),
-    "cart": (frozenset({"constant_load@v", "input_offset@u", "sensor_bias@s"}),),
-    "tanks": (frozenset({"constant_inflow@h_1", "input_offset@u"}),),
-    "thermal": (
-        frozenset({"constant_inflow@T_1", "input_offset@u"}),
-        frozenset({"constant_inflow@T_2", "sensor_bias@T_2", "sensor_scale@T_2"}),
-    ),
-    "car": (frozenset({"constant_load@v", "input_offset@throttle"}),),
-}
-_ONE_SENSOR: dict[str, tuple[frozenset[str], ...]] = {
-    "pendulum": (frozenset({"input_delay@u", "sensor_delay@phi"}),),
-    "cart": (frozenset({"input_delay@u", "sensor_delay@s"}),),
-    "tanks": (frozenset({"input_delay@u", "sensor_delay@h_2"}),),
-    "thermal": (
-        frozenset(
-            {"constant_inflow@T_1", "input_offset@u", "constant_inflow@T_2", "sensor_bias@T_2", "sensor_scale@T_2"}
-        ),
-        frozenset({"input_delay@u", "sensor_delay@T_2"}),
-    ),
-}
-
-
-def twins(system: str, key: str, *, position_only: bool) -> list[str]:
-    """Return `name@place` of what no data of this system can tell from `key`.
-
-    A constant force is an offset of the motor (its gain is a parameter); a spring at rest elsewhere is a sensor's bias;
-    an angle sensor's bias is a tilt; two temperatures with free exchange rates take up every constant; where one sensor
-    reports everything, it is late as much as the input is.
-    """
-    groups = _LEVEL[system] + (_ONE_SENSOR.get(system, ()) if position_only else ())
-    return sorted({other for group in groups if key in group for other in group} - {key})
 
 
 def by_key(system: str, key: str) -> Effect:

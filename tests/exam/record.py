@@ -7,8 +7,9 @@ import numpy as np
 from tests.exam import mujoco_plants
 from tests.exam.draw import CLOSED, DERIVED, NONE, OUTLIERS, QUANTISED, SHAKEN, Set
 from tests.exam.integrate import Rate, simulate
-from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, RATE, SENSOR, Effect, twins
+from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, RATE, SENSOR, Effect
 from tests.exam.plants import SYSTEMS, System
+from tests.exam.twins import twins
 
 TRAIN, TEST, ROWS = 5, 2, 60
 PROCESS = 0.02  # of a rate's standard deviation times the square root of a row: what one row adds of process noise

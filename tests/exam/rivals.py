@@ -1,7 +1,8 @@
 """What others make of the same files: PySINDy's sequentially thresholded least squares, and a forward search by BIC.
 
-Both regress smoothed finite differences on the rig's own columns and the catalogue's shapes, `library`; the parameters of the
-rig are free. What they keep beyond the rig's own columns is the answer. Neither can abstain.
+Both regress differences over a few rows on the rig's own columns and the catalogue's shapes, `library`, averaged over the same
+rows of the smoothed measurements; the parameters of the rig are free. What they keep beyond the rig's own columns is
+the answer. Neither can abstain.
 
 Reference: Brunton, Proctor, Kutz (2016), PNAS 113; Schwarz (1978); Savitzky and Golay (1964).
 """
@@ -19,8 +20,10 @@ from tests.exam import score
 from tests.exam.library import Column, candidates, known, merged
 from tests.exam.plants import SYSTEMS
 
-WINDOW, ORDER = 7, 3  # rows and degree of the smoothing polynomial
-EDGE = 2  # rows at either end that are not used
+WINDOW, ORDER = 5, 3  # rows and degree of the smoothing polynomial
+SPAN = (
+    3  # rows of a finite difference; regressors are averaged over the same rows, so that jumps of a command are exact
+)
 MOST = 6  # terms of the forward search
 THRESHOLDS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the target's norm, with columns of norm 1
 SINDY, BIC = "pysindy", "bic"
@@ -66,25 +69,32 @@ def problem(folder: Path, system: str, measured: list[str]) -> Problem:
         return savgol_filter(raw[name], WINDOW, ORDER, deriv=derivative, delta=told.dt, axis=1)
 
     x = {n: smooth(n) for n in measured} | {n: raw[n] for n in told.inputs}
-    rates = {n: smooth(n, 1) for n in measured}
-    for velocity, position in told.velocity.items():
-        if velocity not in x:
-            x[velocity], rates[velocity] = smooth(position, 1), smooth(position, 2)
+    x |= {velocity: smooth(position, 1) for velocity, position in told.velocity.items() if velocity not in x}
     if system == "car" and "v" not in x:
-        x["v"] = rates["x"] * np.cos(x["theta"]) + rates["y"] * np.sin(x["theta"])
-        rates["v"] = savgol_filter(x["v"], WINDOW, ORDER, deriv=1, delta=told.dt, axis=1)
+        x["v"] = smooth("x", 1) * np.cos(x["theta"]) + smooth("y", 1) * np.sin(x["theta"])
     if set(told.states) - set(x):
         return {}
-    inner = slice(EDGE, rows - EDGE)
-    more = candidates(system, x)
-    return {
-        place: (
-            rates[place][:, inner].ravel(),
-            columns[:, inner].reshape(-1, columns.shape[-1]),
-            [c._replace(values=c.values[:, inner].ravel()) for c in more[place]],
-        )
-        for place, columns in known(system, x).items()
-    }
+    left = {n: c[:, :-1] for n, c in x.items()}  # commands are held: those of a row act until the next one
+    right = {n: c[:, :-1] if n in told.inputs else c[:, 1:] for n, c in x.items()}
+    sides = [(known(system, x), candidates(system, x)) for x in (left, right)]
+    found: Problem = {}
+    for place in sides[0][0]:
+        columns = _mean((sides[0][0][place] + sides[1][0][place]) / 2)
+        pairs = zip(sides[0][1][place], sides[1][1][place], strict=True)
+        more = [a._replace(values=_mean(((a.values + b.values) / 2)[..., None])[:, 0]) for a, b in pairs]
+        ends = raw.get(place, x[place])  # smoothed, they would shift the jumps of a command
+        change = ends[:, SPAN::SPAN] - ends[:, :-SPAN:SPAN]
+        target = change[:, : (rows - 1) // SPAN].ravel() / (SPAN * told.dt)
+        found[place] = (target, columns, [c for c in more if np.any(c.values)])
+    return found
+
+
+def _mean(columns: np.ndarray) -> np.ndarray:
+    """Average columns (episodes, rows, n) over the rows between two ends of a difference, (N, n)."""
+    count = columns.shape[1] // SPAN
+    return (
+        columns[:, : count * SPAN].reshape(len(columns), count, SPAN, -1).mean(axis=2).reshape(len(columns) * count, -1)
+    )
 
 
 def forward(made: Problem) -> list[tuple[str, str]]:

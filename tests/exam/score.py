@@ -18,6 +18,7 @@ NESTED = {  # a special case of the planted effect is no error where the data do
     "outflow_exponent": "leak",
 }
 ACCEPT = 4.5  # nats
+CLEAR = 10.0  # nats of the oracle: what should be found
 ORDER = (RIGHT, TIE, TWIN)
 
 Gains = Mapping[tuple[str, str], float]  # (effect, place) -> evidence of the first step
@@ -91,9 +92,9 @@ def evidence(
     if graded == RIGHT:
         return float(min(e["log_evidence_gain"] for e in found["effects"]))
     if len(truth["effects"]) == 1:
-        own = [gains.get((n, truth["effects"][0]["acts_on"]), -np.inf) for n in truth["effects"][0]["accept"]]
-        if np.isfinite(max(own)):
-            return float(max(own))
+        own = own_gain(truth["effects"][0], gains)
+        if np.isfinite(own):
+            return float(own)
     earned = {(e["name"], e["acts_on"]): e["log_evidence_gain"] for e in oracle["effects"]} if oracle else {}
     each = [max(earned.get((n, e["acts_on"]), 0.0) for n in e["accept"]) for e in truth["effects"]]
     return float(min(each))
@@ -128,9 +129,16 @@ def covered(truth: Mapping[str, Any], graded: str, found: Mapping[str, Any]) -> 
     return sum(p["low"] <= v <= p["high"] for v, p in pairs), len(pairs)
 
 
-def needs_oracle(truth: Mapping[str, Any], graded: str) -> bool:
-    """Whether the tool has to be asked again with the planted names alone."""
-    return truth["kind"] in ("one", "two", "shape") and graded not in (RIGHT, ERROR)
+def needs_oracle(truth: Mapping[str, Any], graded: str, gains: Gains) -> bool:
+    """Whether the tool has to be asked again with the planted names alone: not where the first step shows too little."""
+    if truth["kind"] not in ("one", "two", "shape") or graded in (RIGHT, ERROR):
+        return False
+    return len(truth["effects"]) > 1 or not -np.inf < own_gain(truth["effects"][0], gains) < CLEAR
+
+
+def own_gain(planted: Mapping[str, Any], gains: Gains) -> float:
+    """Evidence of a planted effect in the first step; -inf where it was not fitted."""
+    return max(gains.get((n, planted["acts_on"]), -np.inf) for n in planted["accept"])
 
 
 def names(truth: Mapping[str, Any]) -> Sequence[str]:

@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import beta
 
-from tests.exam.score import ERROR, FALSE, HEDGED, NOTHING, PART, RIGHT, TIE, TWIN, UNEXPLAINED, WRONG
+from tests.exam.score import CLEAR, ERROR, FALSE, HEDGED, NOTHING, PART, RIGHT, TIE, TWIN, UNEXPLAINED, WRONG
 
-CLEAR = 10.0  # nats of the oracle: what should be found
 QUIET = 0.01  # noise up to which names must be exact
 HARMLESS = 1.02  # of the error before
 TOLD = ("simpel", "PySINDy", "BIC")
