@@ -22,6 +22,7 @@ from tests.exam.planted import ABSORBED, EFFECTS, LATE_SENSOR, by_key
 from tests.exam.plants import SYSTEMS
 from tests.exam.record import plant, record
 from tests.exam.twins import twins
+from tests.exam.visible import visible
 from tests.exam.write import write
 
 EXAM = Path(__file__).parent / "exam"
@@ -203,6 +204,14 @@ def test_a_constant_force_is_an_offset_of_the_motor(system: str) -> None:
     moved = plant(told, p, (offset,), ({"b": 0.1},))(x, u, 0.0)
     np.testing.assert_allclose(force, moved, rtol=1e-10)
     assert np.abs(force - told.rate(x, u, p)).max() > 0
+
+
+@pytest.mark.parametrize(("system", "key"), [(s, e.key) for s in SYSTEMS for e in EFFECTS[s] if e.group == ABSORBED])
+def test_what_parameters_take_in_cannot_be_seen(system: str, key: str) -> None:
+    drawn = one(system, key, strength=0.05)
+    assert visible(drawn, record(drawn)) < 0.05
+    other = one(system, next(e.key for e in EFFECTS[system] if e.name == "quadratic_drag"), strength=0.05)
+    assert visible(other, record(other)) > 1
 
 
 def test_draws_keep_the_shares() -> None:
