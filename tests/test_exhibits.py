@@ -35,7 +35,9 @@ def shown() -> dict[str, Exhibit]:
         z[-2] = plan.coordinates.unit(len(z) - 2, q)
         free = search.free(terms)
         eye = np.eye(len(free))
-        return Trial(terms, Optimum(z, free, 0.0, evidence, np.zeros(len(free)), 1e4 * eye, 1e-4 * eye, 5, True))
+        return Trial(
+            terms, Optimum(z, free, 0.0, evidence, np.zeros(len(free)), 1e4 * eye, z[list(free)], 1e-4 * eye, 5, True)
+        )
 
     base, one, other, both = (
         trial((), 0.0, 0.5),

@@ -162,7 +162,7 @@ def effect_section(found: Mapping[str, Any]) -> Section:
         return {}
     return {
         "title": "What was added",
-        "head": ["effect", "size (95 %)", "evidence", "held-out gain (95 %)", "as good as it"],
+        "head": ["effect", "size (90 %)", "evidence", "held-out gain (95 %)", "as good as it"],
         "rows": rows,
         "text": True,
         "note": "Evidence: what the model loses without the effect, everything else fitted anew; 4.5 nat are asked for. "
@@ -187,7 +187,7 @@ def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
         "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
         "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
         "rows": rows,
-        "note": "With 95 % intervals. One whose interval fills its range is not told by these data"
+        "note": "With 90 % intervals. One whose interval fills its range is not told by these data"
         + ("; one that moves far was making up for what the simulator lacked." if found["effects"] else "."),
     }
 
@@ -210,7 +210,7 @@ def remainder_section(found: Mapping[str, Any]) -> Section:
 def reliable(found: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
     """Split what was not found into what has a size and what was left before its fit came to rest."""
     entries = found["not_found"]
-    good = [e for e in entries if e.get("log_evidence_gain", 0.0) > AT_REST]
+    good = [e for e in entries if (e.get("log_evidence_gain") or 0.0) > AT_REST]
     return good, [e for e in entries if e not in good]
 
 
@@ -222,7 +222,7 @@ def not_found_section(found: Mapping[str, Any]) -> Section:
     rows = [
         [f"{words(e['name'])} on {e['acts_on']}", e.get("parameter", ""),
          f"{e['smallest_detectable']:.2g} {e['unit']}".removesuffix(" 1"),
-         f"{e['log_evidence_gain']:.1f} nat" if "log_evidence_gain" in e else "-"]
+         f"{e['log_evidence_gain']:.1f} nat" if e.get("log_evidence_gain") is not None else "screened"]
         for e in sorted(good, key=lambda e: (e["name"], e["acts_on"]))
     ]  # fmt: skip
     after = ""

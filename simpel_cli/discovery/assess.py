@@ -1,5 +1,6 @@
 """How far a model is off: one step, a horizon and a free run ahead, and how probable held-out rows are under it."""
 
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -7,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from simpel_cli.discovery.filter import Track, still
+from simpel_cli.discovery.coordinates import Coordinates
+from simpel_cli.discovery.filter import MOST_KEPT, Filter, Track, still
 from simpel_cli.discovery.setup import Setup
 from simpel_cli.discovery.windows import Windows
 
@@ -42,57 +44,33 @@ class Assessor:
 
     def __init__(self, plan: Setup, horizon: int) -> None:
         self.plan, self.horizon = plan, horizon
-        self._program = jax.jit(jax.vmap(self._window, in_axes=(None, None, 0, 0, 0, 0, 0)))
+        self._program = _program(plan.rule, plan.coordinates.layout, horizon)
 
     def __call__(self, z: np.ndarray, windows: Windows) -> Assessment:
         """Assess the model at unit coordinates z."""
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
-        track, ahead, free = self._program(bounds, jnp.asarray(z), *windows.arrays)
+        count, batch = len(windows.episode), len(self.plan.windows.episode)
+        # batches of one size: windows to learn from and to test on share a program
+        parts = [
+            self._program(bounds, jnp.asarray(z), *(a[np.arange(i, i + batch) % count] for a in windows.arrays))
+            for i in range(0, count, batch)
+        ]
+        track, ahead, free = jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
         ok = np.where(windows.ok > 0, 1.0, np.nan)
-        e, s = np.asarray(track.innovation) * ok, np.asarray(track.variance)
+        e, s = track.innovation * ok, track.variance
         log_likelihood = -0.5 * np.nansum(np.log(s) * ok + e**2 / s + LOG_2PI * ok, axis=(1, 2))
-        ahead, free = np.asarray(ahead), np.asarray(free)
         rows = np.arange(windows.y.shape[1])
         late = rows >= SETTLE
         wrap = self._wrapped(windows.y - free) * ok * np.where(late, 1.0, np.nan)[None, :, None]
         horizon = self._wrapped(windows.y - ahead) * ok
         horizon[:, : SETTLE + self.horizon] = np.nan
         e[:, :SETTLE] = np.nan
-        return Assessment(e, s, horizon, wrap, log_likelihood, free, jax.tree.map(np.asarray, track))
+        return Assessment(e, s, horizon, wrap, log_likelihood, free, track)
 
     def _wrapped(self, error: np.ndarray) -> np.ndarray:
         periodic = {q.name for q in self.plan.augmented.model.states if q.periodic}
         around = np.array([name in periodic for name in self.plan.augmented.measured])
         return np.where(around, (error + np.pi) % (2 * np.pi) - np.pi, error)
-
-    def _window(
-        self, bounds: tuple[Array, ...], z: Array, y: Array, ok: Array, u: Array, start: Array, spread: Array
-    ) -> tuple[Track, Array, Array]:
-        rule = self.plan.rule
-        p, noise = self.plan.coordinates.bounded(bounds).physical(z)
-        track = rule.track(still(p), noise, y, ok, u, start, spread)
-        u_sub = rule.arriving(p, u)
-        rows = y.shape[0]
-
-        def step(x: Array, k: Array) -> tuple[Array, None]:
-            return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)]), None
-
-        def from_row(x: Array, k: Array) -> Array:
-            end = jax.lax.scan(step, x, k + jnp.arange(self.horizon))[0]
-            last = jnp.minimum(k + self.horizon - 1, rows - 1)
-            return rule.measure(p, end, u_sub[last, -1])
-
-        reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
-        ahead = jnp.concatenate([y[: self.horizon], reached])[:rows]
-
-        def run(x: Array, k: Array) -> tuple[Array, Array]:
-            # up to SETTLE the filter's state, from there on the model alone
-            x = jnp.where(k <= SETTLE, track.mean[k], x)
-            read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1])
-            return rule.flow(p, x, u_sub[k]), read
-
-        free = jax.lax.scan(run, start, jnp.arange(rows))[1]
-        return track, ahead, free
 
 
 def rmse(error: np.ndarray) -> np.ndarray:
@@ -132,3 +110,46 @@ def results(assessment: Assessment, measured: tuple[str, ...], rows: float) -> d
             ("one_step", assessment.one_step), ("horizon", assessment.ahead), ("free_run", assessment.free),
         )
     } | {"log_likelihood_per_step": float(assessment.log_likelihood.sum() / rows)}  # fmt: skip
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Any:
+    return jax.jit(jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0)))
+
+
+def _window(
+    rule: Filter,
+    layout: tuple[Any, ...],
+    horizon: int,
+    bounds: tuple[Array, ...],
+    z: Array,
+    y: Array,
+    ok: Array,
+    u: Array,
+    start: Array,
+    spread: Array,
+) -> tuple[Track, Array, Array]:
+    p, noise = Coordinates.of(bounds, layout).physical(z)
+    track = rule.track(still(p), noise, y, ok, u, start, spread)
+    u_sub = rule.arriving(p, u)
+    rows = y.shape[0]
+
+    def step(x: Array, k: Array) -> tuple[Array, None]:
+        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)]), None
+
+    def from_row(x: Array, k: Array) -> Array:
+        end = jax.lax.scan(step, x, k + jnp.arange(horizon))[0]
+        last = jnp.minimum(k + horizon - 1, rows - 1)
+        return rule.measure(p, end, u_sub[last, -1])
+
+    reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
+    ahead = jnp.concatenate([y[:horizon], reached])[:rows]
+
+    def run(x: Array, k: Array) -> tuple[Array, Array]:
+        # up to SETTLE the filter's state, from there on the model alone
+        x = jnp.where(k <= SETTLE, track.mean[k], x)
+        read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1])
+        return rule.flow(p, x, u_sub[k]), read
+
+    free = jax.lax.scan(run, start, jnp.arange(rows))[1]
+    return track, ahead, free

@@ -23,8 +23,8 @@ class Augmented(NamedTuple):
         model: the simulator as it was.
         terms: candidates.
         measured: names of the measured states and outputs, the rows of a measurement.
-        function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, then all knobs.
-        params: the rows of p.
+        function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, all knobs, all constants.
+        params: the rows of p; those of constants have one value for range.
         neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
         operators: kind -> (index of the signal, row of p) for delays and lags, those of the model and of the terms.
         own_delay: (nu) known delays of the model, s.
@@ -57,6 +57,9 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
         for knob in term.knobs:
             params.append(Quantity(knob.name, knob.unit, knob.low, knob.high, prior=knob.prior))
             neutral.append(knob.neutral)
+    for name, value in dict(c for term in terms for c in term.constants).items():
+        params.append(Quantity(name, "1", value, value))
+        neutral.append(value)
     x = model.symbol.sym("x", len(model.states), 1)
     u = model.symbol.sym("u", len(model.inputs), 1)
     p = model.symbol.sym("p", len(params), 1)

@@ -37,14 +37,19 @@ class Coordinates(NamedTuple):
     nx: int
 
     @property
+    def layout(self) -> tuple[tuple[int, int, int], tuple[int, ...], int]:
+        """What programs are compiled for; the bounds are arguments."""
+        return self.sizes, self.driven, self.nx
+
+    @staticmethod
+    def of(bounds: tuple[Any, ...], layout: tuple[Any, ...]) -> "Coordinates":
+        """Put together what `bounds` and `layout` took apart."""
+        return Coordinates(*bounds, *layout)
+
+    @property
     def bounds(self) -> tuple[np.ndarray, ...]:
         """What depends on the measurements: an argument of compiled programs, so that other data share them."""
         return self.low, self.high, self.log, self.normal
-
-    def bounded(self, bounds: tuple[Any, ...]) -> "Coordinates":
-        """Return the same coordinates with other bounds, e.g. traced ones."""
-        low, high, log, normal = bounds
-        return self._replace(low=low, high=high, log=log, normal=normal)
 
     def physical(self, z: Float[Array, " n"]) -> tuple[Array, Noise]:
         """Return p and the noise at unit coordinates z."""
@@ -58,7 +63,9 @@ class Coordinates(NamedTuple):
         """Return the unit coordinate of a physical value, kept inside the bounds."""
         value = np.asarray(value, float)
         v = np.where(self.log[index], np.log(np.maximum(value, 1e-300)), value)
-        return np.clip((v - self.low[index]) / (self.high[index] - self.low[index]), 0.0, 1.0)
+        span = self.high[index] - self.low[index]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(span > 0, np.clip((v - self.low[index]) / span, 0.0, 1.0), 0.5)
 
     def value(self, index: int, z: float) -> float:
         """Return the physical value of one unit coordinate."""

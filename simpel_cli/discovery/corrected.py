@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from simpel_cli.discovery.selection import Search, Trial
-from simpel_cli.discovery.verdict import interval_of
+from simpel_cli.discovery.verdict import Z95, interval_of
 from simulators.effects import Term
 from simulators.effects.term import DELAY, INPUT, LAG, RATE, SENSOR, SENSOR_DELAY
 
@@ -36,7 +36,7 @@ def corrected(sim: dict[str, Any], search: Search, trial: Trial) -> tuple[str, d
             short = short if short not in taken else knob.name
             taken.add(short)
             names[knob.name] = short
-            span = interval_of(search, trial, row)
+            span = interval_of(search, trial, row, Z95)
             low, high = sorted((span["low"], span["high"]))
             node["parameters"][short] = (
                 {"unit": knob.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]

@@ -13,6 +13,7 @@ numbers.
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004).
 """
 
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -82,14 +83,35 @@ def still(p: Float[Array, "dp ..."]) -> Moving:
     return Moving(p, jnp.full(points, p.shape[0]), jnp.zeros(points, p.dtype))
 
 
+_KEPT: OrderedDict[tuple, Filter] = OrderedDict()
+MOST_KEPT = (
+    16  # filters; searches of one process that differ in their measurements only share what was traced and compiled
+)
+
+
 def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
-    """Filter of an augmented model, float64.
+    """Filter of an augmented model, float64; the same object for models that are the same.
 
     Args:
         augmented: model with candidates.
         substeps: Runge-Kutta steps per row.
         lead: rows of past input in front of each window.
     """
+    model = augmented.model
+    key = (
+        augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
+        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag, substeps,
+        lead,
+    )  # fmt: skip
+    if key not in _KEPT:
+        _KEPT[key] = _filter_of(augmented, substeps, lead)
+        while len(_KEPT) > MOST_KEPT:
+            _KEPT.popitem(last=False)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
+def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     model = augmented.model
     rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)

@@ -12,7 +12,7 @@ Reference: Levenberg (1944), Marquardt (1963); Kass and Raftery (1995), Bayes fa
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.discovery.coordinates import Coordinates
-from simpel_cli.discovery.filter import Filter, Moving, Noise
+from simpel_cli.discovery.filter import MOST_KEPT, Filter, Moving, Noise
 from simpel_cli.discovery.windows import Windows
 
 LEAST_CURVATURE = 12.0
@@ -51,7 +51,9 @@ class Optimum(NamedTuple):
         log_evidence: Laplace; -inf where the filter diverged.
         gradient: (d,) of the loss where it came to rest.
         fisher: (d, d) information with the prior's, unit coordinates.
-        covariance: (d, d) of the free unknowns, unit coordinates.
+        centre: (d,) mean of the posterior as a Gaussian. A uniform prior enters with its mean and variance: in a
+            direction that the data do not see, the optimum may lie anywhere.
+        covariance: (d, d) of the free unknowns about it, unit coordinates.
         iterations: taken.
         converged: whether the last steps no longer helped.
     """
@@ -62,6 +64,7 @@ class Optimum(NamedTuple):
     log_evidence: float
     gradient: np.ndarray
     fisher: np.ndarray
+    centre: np.ndarray
     covariance: np.ndarray
     iterations: int
     converged: bool
@@ -97,7 +100,7 @@ class Fitter:
     ) -> None:
         self.coordinates, self.windows, self.lanes, self.width = coordinates, windows, lanes, width
         self._data = tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
-        self._program = jax.jit(partial(_advance, rule, coordinates))
+        self._program = _program(rule, coordinates.layout)
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
         self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
@@ -110,7 +113,7 @@ class Fitter:
         while waiting.size:
             chunks = [waiting[i : i + self.lanes] for i in range(0, len(waiting), self.lanes)]
             # the first call compiles: not twice side by side
-            threads = self._threads.map if self._program._cache_size() else map  # type: ignore[attr-defined]
+            threads = self._threads.map if self._program._cache_size() else map
             for chunk, ended in zip(chunks, threads(partial(self._advanced, state, most), chunks), strict=True):
                 for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
@@ -144,14 +147,17 @@ class Fitter:
         z = state.z[i].copy()
         d = len(free)
         z[list(free)] = state.part[i, :d]
+        uniform = ~self.coordinates.normal[list(free)]
         return _optimum(
-            z, free, float(state.loss[i]), state.gradient[i], state.fisher[i], int(state.iteration[i]), bool(state.done[i])
+            z, free, uniform, float(state.loss[i]), state.gradient[i], state.fisher[i], int(state.iteration[i]),
+            bool(state.done[i]),
         )  # fmt: skip
 
 
 def _optimum(
     z: np.ndarray,
     free: tuple[int, ...],
+    uniform: np.ndarray,
     loss: float,
     gradient: np.ndarray,
     fisher: np.ndarray,
@@ -161,24 +167,30 @@ def _optimum(
     d = len(free)
     gradient, fisher = gradient[:d], fisher[:d, :d]
     if not np.isfinite(loss) or not np.isfinite(fisher).all():
-        return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), np.eye(d), iterations, False)
-    values, vectors = np.linalg.eigh(fisher)
-    values = np.maximum(values, LEAST_CURVATURE)
+        return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), z[list(free)], np.eye(d), iterations, False)
+    values = np.maximum(np.linalg.eigvalsh(fisher), LEAST_CURVATURE)
     at = z[list(free)]
+    prior = np.where(uniform, LEAST_CURVATURE, 0.0)
+    covariance = np.linalg.inv(fisher + np.diag(prior))
+    centre = at - covariance @ (prior * (at - 0.5))
     bounded = np.sum((at < AT_BOUND) | (at > 1 - AT_BOUND))
     evidence = -loss + d / 2 * np.log(2 * np.pi) - 0.5 * np.log(values).sum() - np.log(2) * bounded
-    covariance = (vectors / values) @ vectors.T
-    return Optimum(z, free, float(loss), float(evidence), gradient, fisher, covariance, iterations, converged)
+    return Optimum(z, free, float(loss), float(evidence), gradient, fisher, centre, covariance, iterations, converged)
 
 
 Evaluate = Callable[[Array], tuple[Array, Array, Array]]
 
 
+@lru_cache(maxsize=MOST_KEPT)
+def _program(rule: Filter, layout: tuple[Any, ...]) -> Any:
+    return jax.jit(partial(_advance, rule, layout))
+
+
 def _advance(
-    rule: Filter, coordinates: Coordinates, bounds: tuple[Array, ...], most: Array, lanes: Course, data: Any
+    rule: Filter, layout: tuple[Any, ...], bounds: tuple[Array, ...], most: Array, lanes: Course, data: Any
 ) -> Course:
     """Levenberg-Marquardt on Fisher information, inside the unit box: `most` iterations of every lane."""
-    coordinates = coordinates.bounded(bounds)
+    coordinates = Coordinates.of(bounds, layout)
     evaluate = partial(_evaluate, rule, coordinates, lanes, data)
 
     def body(carry: tuple[Course, Array]) -> tuple[Course, Array]:

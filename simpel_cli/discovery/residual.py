@@ -10,14 +10,15 @@ the data ask for, over the whole record.
 Reference: Rauch, Tung and Striebel (1965); Sarkka (2013), Bayesian filtering and smoothing, theorem 8.2.
 """
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.discovery.coordinates import Coordinates
-from simpel_cli.discovery.filter import Filter, Track
+from simpel_cli.discovery.filter import MOST_KEPT, Filter, Track
 from simpel_cli.discovery.windows import Windows
 
 CHUNK = 512  # rows of one call of the compiled flow
@@ -104,8 +105,7 @@ class Forces:
 
     def __init__(self, rule: Filter, coordinates: Coordinates, dt: float) -> None:
         self.coordinates, self.dt = coordinates, dt
-        self._flow = jax.jit(jax.vmap(rule.flow, in_axes=(None, 0, 0)))
-        self._arriving = jax.jit(jax.vmap(rule.arriving, in_axes=(None, 0)))
+        self._flow, self._arriving = _programs(rule)
 
     def __call__(self, z: np.ndarray, track: Track, windows: Windows) -> Force:
         """Return the latent force of the model at unit coordinates z, from its filter's track."""
@@ -124,3 +124,11 @@ class Forces:
             rows = np.minimum(np.arange(begin, begin + CHUNK), len(x) - 1)
             parts.append(np.asarray(self._flow(p, x[rows], u[rows])))
         return np.concatenate(parts)[: len(x)].reshape(state.shape)
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _programs(rule: Filter) -> tuple[Any, Any]:
+    return (
+        jax.jit(jax.vmap(rule.flow, in_axes=(None, 0, 0))),
+        jax.jit(jax.vmap(rule.arriving, in_axes=(None, 0))),
+    )

@@ -8,7 +8,7 @@ Reference: Rao (1948), Large sample tests of statistical hypotheses; Cox and Hin
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,23 @@ if TYPE_CHECKING:
     from simpel_cli.discovery.selection import Search, Trial
 
 
-def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane]]) -> np.ndarray:
-    """Return the gain in log posterior that each start of each term promises, (n,); inf where a score cannot tell.
+class Score(NamedTuple):
+    """What the slope at a switched-off term says.
+
+    Args:
+        gain: in log posterior, nats, with the known unknowns refitted; inf where a score cannot tell.
+        sd: of the first amplitude, in its range; inf likewise.
+    """
+
+    gain: float
+    sd: float
+
+
+UNTOLD = Score(np.inf, np.inf)
+
+
+def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+    """Return what each start of each term promises.
 
     Args:
         search: whose fitter is used.
@@ -48,7 +63,7 @@ def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane
             for row, knob in zip(search.rows[starts[i][0]], search.terms[starts[i][0]].knobs, strict=True):
                 z[row] = plan.start[row] if knob.neutral == 0 else starts[i][1].z[row]
         lanes.append(Lane(z, known + tuple(r for i in group for r in search.rows[starts[i][0]]), search.ones))
-    found = np.full(len(starts), np.inf)
+    found = [UNTOLD] * len(starts)
     for group, optimum in zip(groups, search.fitter(lanes, 1), strict=True):
         for i in group:
             rows = [
@@ -60,16 +75,17 @@ def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane
     return found
 
 
-def _promise(gradient: np.ndarray, fisher: np.ndarray, rows: list[int], known: int, at: np.ndarray) -> float:
+def _promise(gradient: np.ndarray, fisher: np.ndarray, rows: list[int], known: int, at: np.ndarray) -> Score:
     """Gain of moving the knobs `rows`, those at a bound only inwards, while the first `known` unknowns follow."""
     inward = [r for r in rows if not (at[r] <= 0 and gradient[r] >= 0) and not (at[r] >= 1 and gradient[r] <= 0)]
     if not np.isfinite(fisher).all() or not any(fisher[r, r] > 0 for r in rows):
-        return np.inf
-    if not inward:
-        return 0.0
+        return UNTOLD
     base = fisher[:known, :known] + LEAST_CURVATURE * np.eye(known)
-    cross = fisher[:known, inward]
-    schur = fisher[np.ix_(inward, inward)] - cross.T @ np.linalg.solve(base, cross)
-    schur += LEAST_CURVATURE * np.eye(len(inward))
-    g = gradient[inward] - cross.T @ np.linalg.solve(base, gradient[:known])
-    return float(0.5 * g @ np.linalg.solve(schur, g))
+    cross = fisher[:known, rows]
+    schur = fisher[np.ix_(rows, rows)] - cross.T @ np.linalg.solve(base, cross)
+    schur += LEAST_CURVATURE * np.eye(len(rows))
+    g = gradient[rows] - cross.T @ np.linalg.solve(base, gradient[:known])
+    sd = float(np.sqrt(np.linalg.inv(schur)[0, 0]))
+    kept = [rows.index(r) for r in inward]
+    g, schur = g[kept], schur[np.ix_(kept, kept)]
+    return Score(float(0.5 * g @ np.linalg.solve(schur, g)) if kept else 0.0, sd)

@@ -36,6 +36,7 @@ class Stage(NamedTuple):
 
     before: Trial
     trials: tuple[Trial, ...]  # each is `before` and one term more
+    screened: tuple[tuple[int, float], ...] = ()  # terms that were not fitted: standard deviation of the amplitude
 
 
 class Selection(NamedTuple):
@@ -75,6 +76,7 @@ class Search:
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
+        self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
         """Unknowns that move when these terms are there."""
@@ -113,25 +115,33 @@ class Search:
             z[:n] = random.uniform(0.1, 0.9, n)
             starts.append(z)
         found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
-        return Trial((), max(found, key=lambda o: o.log_evidence))
+        return self.best((), found)
 
-    def add(self, before: Trial, candidates: Sequence[int]) -> list[Trial]:
+    def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:
+        """Return the best of some fits of one set of terms, or an earlier one that was better."""
+        name = frozenset(terms)
+        known = [self.known[name]] if name in self.known else []
+        self.known[name] = max([*found, *known], key=lambda o: o.log_evidence)
+        return Trial(terms, self.known[name])
+
+    def add(self, before: Trial, candidates: Sequence[int]) -> Stage:
         """Fit `before` with one of the candidates more, each from its promising starts; best first."""
         self.tried += len(candidates)
         starts = [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
-        promised = promises(self, before, starts)
+        scores = promises(self, before, starts)
+        promised = np.array([score.gain for score in scores])
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
         finite = promised[np.isfinite(promised)]
         least = max(PROMISING, SHARE * float(finite.max(initial=0.0)))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > least]
         found = self.fitter([starts[i][1] for i in going])
-        best: dict[int, Optimum] = {}
+        fits: dict[int, list[Optimum]] = {}
         for i, optimum in zip(going, found, strict=True):
-            t = starts[i][0]
-            if t not in best or optimum.log_evidence > best[t].log_evidence:
-                best[t] = optimum
-        trials = [Trial((*before.terms, t), optimum) for t, optimum in best.items()]
-        return sorted(trials, key=lambda t: -t.optimum.log_evidence)
+            fits.setdefault(starts[i][0], []).append(optimum)
+        trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
+        left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
+        ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
+        return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
 
     def best_named(self, trials: Sequence[Trial]) -> Trial | None:
         """Best trial with a named new effect; a more general name must earn its generality over a simpler one."""
@@ -158,18 +168,19 @@ class Search:
         remainder = None
         self.told("calibrated")
         while True:
-            trials = self.add(current, self.candidates(current.terms))
+            stage = self.add(current, self.candidates(current.terms))
+            trials = stage.trials
             if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
                 again = self.fitter(
                     [Lane(self.off(t.optimum.z, t.terms[-1:]), self.free(current.terms), self.ones) for t in trials[:4]]
                 )
-                better = max(again, key=lambda o: o.log_evidence)
-                if better.log_evidence > current.optimum.log_evidence + 1:
-                    current = Trial(current.terms, better)
+                better = self.best(current.terms, again)
+                if better.optimum.log_evidence > current.optimum.log_evidence + 1:
+                    current = better
                     path[-1] = current
                     base = current if not current.terms else base
                     continue
-            stages.append(Stage(current, tuple(trials)))
+            stages.append(stage)
             best = self.best_named(trials)
             unnamed = next((t for t in trials if self.terms[t.terms[-1]].depends_on), None)
             gain = best.optimum.log_evidence - current.optimum.log_evidence if best else -np.inf
@@ -210,12 +221,12 @@ class Search:
             loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
             lanes += [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
         found = self.fitter(lanes)
-        return [Trial(rest, max(found[2 * i : 2 * i + 2], key=lambda o: o.log_evidence)) for i, rest in enumerate(sets)]
+        return [self.best(rest, found[2 * i : 2 * i + 2]) for i, rest in enumerate(sets)]
 
     def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
         """Return the trials in which another name takes the place of the term that `rest` lacks, and does as well."""
         (own,) = set(chosen.terms) - set(rest.terms)
-        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own])
+        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own]).trials
         top, own_effect = chosen.optimum.log_evidence, self.terms[own].effect
         return tuple(
             t

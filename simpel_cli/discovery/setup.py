@@ -95,9 +95,10 @@ def setup(
     )
     n_p, n_r, n_q = coordinates.sizes
     start = np.full(len(coordinates.low), 0.5)
-    low, high = coordinates.low[:n_p], coordinates.high[:n_p]
-    base = len(model.params)
-    start[base:n_p] = (augmented.neutral[base:] - low[base:]) / (high[base:] - low[base:])
+    knobs = np.arange(len(model.params), n_p)
+    span = coordinates.high[knobs] - coordinates.low[knobs]
+    # not cut to the bounds: a neutral value may lie beyond them
+    start[knobs] = (augmented.neutral[knobs] - coordinates.low[knobs]) / np.where(span > 0, span, 1.0)
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
     return Setup(augmented, rule, coordinates, windows, scales, start, lead, substeps)

@@ -41,9 +41,11 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
         [(q.low, q.high) for q in group] for group in (augmented.model.states, augmented.model.inputs, augmented.params)
     ]
     checked(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]), ranges)
-    value = to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]))
+    # jit within jit: the lists of instructions are walked once, not in every program that uses them
+    value = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"])))
     slopes = [values, in_x, in_u, casadi.vec(in_p.T)]
-    all_of = to_jax_rows(casadi.Function("slopes", [x, u, p], casadi.cse(slopes), names, ["v", "by_x", "by_u", "by_p"]))
+    with_all = casadi.Function("slopes", [x, u, p], casadi.cse(slopes), names, ["v", "by_x", "by_u", "by_p"])
+    all_of = jax.jit(to_jax_rows(with_all))
     places_x, places_u = _places(in_x), _places(in_u)
 
     @jax.custom_jvp

@@ -184,7 +184,7 @@ def _estimate(name: str, value: float, drawn: np.ndarray, episodes: int) -> dict
 
 
 def parameter_columns(search: Search, selection: Selection) -> Columns:
-    """Return value and 95 % interval of every parameter, before and after, with its declared range.
+    """Return value and 90 % interval of every parameter, before and after, with its declared range.
 
     Parameters of effects have no `before`, and `effect` says whose they are.
     """

@@ -13,7 +13,7 @@ from simulators.effects import Term
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
-Z95 = 1.959963984540054
+Z90, Z95 = 1.6448536269514722, 1.959963984540054
 
 
 def verdict_of(
@@ -58,6 +58,7 @@ def verdict_of(
         "verdict": kind,
         "summary": "",
         "effects": effects,
+        "interval": 0.9,
         "remainder": remainder,
         "parameters": _parameters(search, selection.base, chosen),
         "error": {
@@ -82,21 +83,19 @@ def verdict_of(
     return found | {"summary": sentence(found, before, after, measured)}
 
 
-def interval_of(search: Search, trial: Trial, row: int) -> dict[str, float]:
-    """Return value and 95 % interval of one unknown of a fit, in its unit."""
+def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[str, float]:
+    """Return value and 90 % interval of one unknown of a fit, in its unit; z: half width in standard deviations."""
     coordinates, optimum = search.plan.coordinates, trial.optimum
-    at = optimum.z[row]
-    sd = float(np.sqrt(optimum.covariance[i, i])) if (i := _position(optimum.free, row)) is not None else 0.0
-    low, high = (float(np.clip(at + s * Z95 * sd, 0, 1)) for s in (-1, 1))
+    at, sd = float(optimum.z[row]), 0.0
+    if row in optimum.free:
+        i = optimum.free.index(row)
+        at, sd = float(np.clip(optimum.centre[i], 0, 1)), float(np.sqrt(optimum.covariance[i, i]))
+    low, high = (float(np.clip(at + s * z * sd, 0, 1)) for s in (-1, 1))
     return {
         "value": coordinates.value(row, at),
         "low": coordinates.value(row, low),
         "high": coordinates.value(row, high),
     }
-
-
-def _position(free: tuple[int, ...], row: int) -> int | None:
-    return free.index(row) if row in free else None
 
 
 def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
@@ -177,26 +176,27 @@ def _noise(search: Search, trial: Trial) -> tuple[list[float], float]:
 def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
     """Return the smallest size of every other effect that would have been seen: it earns ACCEPT nats."""
     last = selection.stages[-1]
-    rows = []
+    if last.before.terms != selection.chosen.terms:
+        return []
+    seen: list[tuple[int, float, float | None]] = [(t, sd, None) for t, sd in last.screened]
     for trial in last.trials:
-        term = search.terms[trial.terms[-1]]
         gain = trial.optimum.log_evidence - last.before.optimum.log_evidence
-        if term.depends_on or trial.terms[:-1] != selection.chosen.terms or gain < LOST:
-            continue
-        row = search.rows[trial.terms[-1]][0]
-        i = trial.optimum.free.index(row)
-        sd = float(np.sqrt(trial.optimum.covariance[i, i]))
+        i = trial.optimum.free.index(search.rows[trial.terms[-1]][0])
+        if gain > LOST:
+            seen.append((trial.terms[-1], float(np.sqrt(trial.optimum.covariance[i, i])), float(gain)))
+    rows = []
+    for t, sd, earned in seen:
+        term, row = search.terms[t], search.rows[t][0]
         occam = max(-np.log(sd * np.sqrt(2 * np.pi)), 0.0)
         size = sd * np.sqrt(2 * (ACCEPT + occam))
-        knob = term.knobs[0]
         span = search.plan.coordinates.high[row] - search.plan.coordinates.low[row]
-        if size < 1:
+        if size < 1 and not term.depends_on:
+            knob = term.knobs[0]
             rows.append(
                 {"name": term.effect, "acts_on": term.acts_on, "parameter": knob.label,
-                 "smallest_detectable": float(size * span), "unit": knob.unit,
-                 "log_evidence_gain": gain}
+                 "smallest_detectable": float(size * span), "unit": knob.unit, "log_evidence_gain": earned}
             )  # fmt: skip
-    return rows
+    return sorted(rows, key=lambda row: (row["name"], row["acts_on"]))
 
 
 def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measured: tuple[str, ...]) -> str:

@@ -124,7 +124,7 @@ def _bracket(axis: Any, own: dict[str, np.ndarray], shown: list[int], accepted: 
 
 
 def draw_parameters(found: dict[str, Any], path: Path) -> Any:
-    """Draw parameters with 95 % intervals, before and after, in their declared ranges."""
+    """Draw parameters with 90 % intervals, before and after, in their declared ranges."""
     table = columns_of(path)
     if not found["effects"]:
         table = {name: column[table["model"] == "before"] for name, column in table.items()}

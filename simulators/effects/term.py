@@ -38,6 +38,8 @@ class Term(NamedTuple):
         generalises: effects that it becomes when some of its knobs are neutral.
         dissipative: it never adds energy.
         depends_on: arguments of a function without a physical name; empty for named effects.
+        constants: numbers of the expression that were read off the measurements, by name; programs take them as
+            arguments, so that other measurements share what was compiled.
     """
 
     effect: str
@@ -50,6 +52,7 @@ class Term(NamedTuple):
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
     depends_on: tuple[str, ...] = ()
+    constants: tuple[tuple[str, float], ...] = ()
 
     @property
     def label(self) -> str:

@@ -32,32 +32,32 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
                 continue
             prefix = f"unnamed_{name}_of_{argument}_w"
             amplitude = AMPLITUDE * scales.rate[name]
-            size = _rounded(scales.size[argument])
-            waves, shares = _harmonics(argument) if argument in periodic else _sines(argument, size)
+            turns = argument in periodic
+            size = (f"size_of_{argument}", scales.size[argument])
+            waves, shares = _harmonics(argument) if turns else _sines(argument, size[0])
             knobs = tuple(
                 Knob(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
                 for j, sd in enumerate((amplitude * share for share in shares), start=1)
             )
             text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(knobs, waves, strict=True))
             meaning = f"some function of {argument}"
-            terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,)))
+            terms.append(
+                Term(
+                    "unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,),
+                    constants=() if turns else (size,),
+                )  # fmt: skip
+            )
     return terms
 
 
-def _rounded(size: float) -> float:
-    """Round up to a few steps a decade: similar data then have the same expressions, and share compiled programs."""
-    decade = 10.0 ** math.floor(math.log10(size))
-    return next(step * decade for step in (1, 1.5, 2, 3, 5, 7, 10) if step * decade >= size * (1 - 1e-12))
-
-
-def _sines(argument: str, size: float) -> tuple[list[str], list[float]]:
-    box, length = BOX * size, LENGTHSCALE * size
+def _sines(argument: str, size: str) -> tuple[list[str], list[float]]:
+    """Sines of the box, in units of the argument's largest magnitude."""
     waves, shares = [], []
     for j in range(1, BASES + 1):
-        frequency = math.pi * j / (2 * box)
-        waves.append(_multiple("sin", j, f"({math.pi / (2 * box):.6g}*({argument} + {box:.6g}))"))
-        density = math.sqrt(2 * math.pi) * length * math.exp(-((frequency * length) ** 2) / 2)
-        shares.append(math.sqrt(density / box))
+        frequency = math.pi * j / (2 * BOX)
+        waves.append(_multiple("sin", j, f"({math.pi / (2 * BOX):.15g}*({argument}/{size} + {BOX}))"))
+        density = math.sqrt(2 * math.pi) * LENGTHSCALE * math.exp(-((frequency * LENGTHSCALE) ** 2) / 2)
+        shares.append(math.sqrt(density / BOX))
     return waves, shares
 
 
