@@ -22,6 +22,7 @@ from simpel_cli.discovery.discriminate import Forecast, Members, forecast
 from simpel_cli.discovery.episodes import Proposal, neighbours, proposals, reach_of, rows_of, signal
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.selection import TIE, Search, Selection, Trial
+from simpel_cli.discovery.twins import twins
 from simpel_cli.records import write_text
 
 FILE = "next_experiment.csv"
@@ -98,15 +99,18 @@ def class_of(search: Search, selection: Selection) -> Class:
             term = terms[trial.terms[-1]]
             if term.effect != terms[chosen].effect:
                 others.setdefault(term.effect, trial)
-        group = [(0, terms[chosen])]
+        group = [(0, chosen)]
         for trial in list(others.values())[: MOST - len(trials)]:
-            group.append((len(trials), terms[trial.terms[-1]]))
+            group.append((len(trials), trial.terms[-1]))
             trials.append(trial)
         own = [
             (i, j)
             for i, first in group
             for j, second in group
-            if i != j and first.effect not in second.same_as and second.effect not in first.same_as
+            if i != j
+            and terms[first].effect not in terms[second].same_as
+            and terms[second].effect not in terms[first].same_as
+            and not twins(search, selection.chosen, (first, trials[i]), (second, trials[j]))
         ]
         if own:
             names.append(terms[chosen].effect)

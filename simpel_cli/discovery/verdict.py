@@ -8,6 +8,7 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
+from simpel_cli.discovery.twins import twins
 from simpel_cli.discovery.windows import Windows
 from simulators.effects import Term
 
@@ -101,6 +102,11 @@ def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[
 def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
     term = search.terms[selection.chosen.terms[i]]
     rows = search.rows[selection.chosen.terms[i]]
+    same = [
+        search.terms[t.terms[-1]].effect
+        for t in selection.classes[i]
+        if twins(search, selection.chosen, (selection.chosen.terms[i], selection.chosen), (t.terms[-1], t))
+    ]
     names = [term.effect] + [search.terms[t.terms[-1]].effect for t in selection.classes[i]]
     places = {term.effect: term.acts_on} | {
         search.terms[t.terms[-1]].effect: search.terms[t.terms[-1]].acts_on for t in selection.classes[i]
@@ -113,7 +119,7 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         "meaning": term.meaning,
         "class": list(dict.fromkeys(names)),
         "class_acts_on": places,
-        "same_as": list(term.same_as),
+        "same_as": list(dict.fromkeys([*term.same_as, *same])),
         "log_evidence_gain": selection.gains[i],
         "held_out_gain": None if gate is None else gate._asdict(),
         "parameters": {
@@ -235,4 +241,6 @@ def _phrase(effect: dict[str, Any]) -> str:
         f"{name} = {p['value']:.3g} ({p['low']:.3g}..{p['high']:.3g}) {p['unit']}"
         for name, p in effect["parameters"].items()
     )
-    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values})"
+    twin = [n.replace("_", " ") for n in effect["class"] if n != effect["name"] and n in effect["same_as"]]
+    also = f", which here is the same as {' and '.join(twin)}" if twin else ""
+    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}"

@@ -1,0 +1,56 @@
+"""Two names of one function: told by the model, not by a list."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.fit import Fitter, Optimum
+from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.setup import setup
+from simpel_cli.discovery.twins import twins
+from simulators.effects import Expression
+from simulators.model import Declared
+
+EFFECTS = [
+    Expression("load", acts_on="v", term="c", parameters={"c": {"range": [-1, 1], "unit": "A"}}),
+    Expression("offset", acts_on="input", term="u + b", parameters={"b": {"range": [-1, 1], "unit": "U"}}),
+    Expression("drag", acts_on="v", term="-k*v*abs(v)", parameters={"k": {"range": [0, 2], "unit": "A/V^2"}}),
+]
+
+
+def searched(gain: str) -> Search:
+    model = Declared(
+        "lane", dt=0.1,
+        states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-3, 3]}},
+        inputs={"u": {"unit": "V", "range": [-3, 3]}},
+        parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
+        dynamics={"s": "v", "v": f"{gain}*u"},
+    ).model()  # fmt: skip
+    random = np.random.default_rng(0)
+    episodes = tuple(
+        Episode(f"{k}", np.arange(12) * 0.1, random.normal(size=(12, 2)), random.normal(size=(12, 1)), np.zeros((12, 0)))
+        for k in range(4)
+    )
+    recording = Recording(episodes[:3], episodes[3:], (), {"s": 0.1, "v": 0.1}, (), (Check("c", True, ""),), ())
+    plan = setup(model, recording, (), EFFECTS, 1)
+    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=1, width=12))
+
+
+def fitted(search: Search, name: str, value: float) -> tuple[int, Trial]:
+    t = next(i for i, term in enumerate(search.terms) if term.effect == name)
+    z: Any = search.plan.start.copy()
+    z[search.rows[t][0]] = search.plan.coordinates.unit(search.rows[t][0], value)
+    free = search.free((t,))
+    nothing = np.zeros(len(free)), np.eye(len(free)), z[list(free)], np.eye(len(free))
+    return t, Trial((t,), Optimum(z, free, 0.0, 0.0, *nothing, 1, True))
+
+
+@pytest.mark.parametrize(("gain", "same"), [("b", True), ("b*(1 + 0.5*s)", False)])
+def test_an_offset_is_a_load_where_the_input_enters_with_a_constant_gain(gain: str, same: bool) -> None:
+    search = searched(gain)
+    load, offset, drag = (fitted(search, name, 0.4) for name in ("load", "offset", "drag"))
+    assert twins(search, load[1], load, offset) is same
+    assert not twins(search, load[1], load, drag)
+    assert twins(search, load[1], load, fitted(search, "load", 0.2))
