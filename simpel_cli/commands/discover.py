@@ -59,7 +59,7 @@ def effects_of(node: Mapping[str, Any] | None, plugins: tuple[str, ...]) -> list
 
 def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest) -> dict[str, Any]:
     began = time.perf_counter()
-    study = open_study(config, data_folder)
+    study = open_study(config, data_folder, whole=False)
     manifest.add_inputs(study.recording.files)
     model = study.system.source
     if not isinstance(model, Model):

@@ -87,8 +87,13 @@ def source_of(config: dict[str, Any], settings: Settings) -> Any:
         raise ConfigError(str(error)) from error
 
 
-def open_study(config: dict[str, Any], data_folder: Path) -> Study:
+def open_study(config: dict[str, Any], data_folder: Path, *, whole: bool = True) -> Study:
     """Build every object of a configuration and read the measurements.
+
+    Args:
+        config: of the job.
+        data_folder: of the data YAML.
+        whole: whether every state is needed in every row (see `data.reader.read`).
 
     Raises:
         ConfigError: a key.
@@ -102,7 +107,7 @@ def open_study(config: dict[str, Any], data_folder: Path) -> Study:
     evaluation = build(config.get("evaluation") or {}, "evaluation", default=Evaluation)
     source = source_of(config, settings)
     # the split does not depend on run.seed: every seed of a sweep is judged on the same episodes
-    recording = read(measurements, source, data_folder, 0)
+    recording = read(measurements, source, data_folder, 0, whole=whole)
     system = system_of(source, recording.outputs, measurements.stack_actions)
     return Study(
         settings, device, system, measurements, recording, **parts, evaluation=evaluation, choices=config["choices"]

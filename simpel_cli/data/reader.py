@@ -21,7 +21,7 @@ from simpel_cli.errors import DataError
 from simulators.model import Quantity
 
 
-def read(config: Measurements, model: Source, base: Path, seed: int) -> Recording:
+def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True) -> Recording:
     """Read measurements for a simulator.
 
     Args:
@@ -29,6 +29,8 @@ def read(config: Measurements, model: Source, base: Path, seed: int) -> Recordin
         model: gives names, order, units, ranges and dt.
         base: folder of the config file; relative paths are tried there first, then in the working directory.
         seed: of the run; `config.seed` wins.
+        whole: every state is needed in every row, so refuse one that is not measured and cannot be estimated; else it
+            stays NaN.
 
     Returns:
         Checked episodes, at least one each to train and to test on.
@@ -58,7 +60,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int) -> Recordin
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
     else:
         report.append(checks.monotonic(rows, table, config))
-        parts, noise, more = _trajectories(config, model, rows, mapping)
+        parts, noise, more = _trajectories(config, model, rows, mapping, whole)
         report += more
     for part, episodes in parts.items():
         if not episodes:
@@ -75,7 +77,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int) -> Recordin
 
 
 def _trajectories(
-    config: Measurements, model: Source, rows: Rows, mapping: Mapping
+    config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
     """Episodes by split, noise by quantity, checks."""
     sampling, raw = checks.sampling(rows, model, config)
@@ -85,7 +87,7 @@ def _trajectories(
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
-        episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw)
+        episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
     noise = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])

@@ -67,7 +67,9 @@ def speeds(model: Source) -> dict[str, list[str]]:
     return found
 
 
-def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float) -> Smoothed:
+def estimate_speeds(
+    model: Source, episodes: Sequence[Episode], unmeasured: tuple[str, ...], raw: float, *, required: bool = True
+) -> Smoothed:
     """Fill in the states that were not measured: speeds first, then what drives a measured state (`hidden`).
 
     Args:
@@ -75,6 +77,7 @@ def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tupl
         episodes: contiguous rows, angles unwrapped; training first.
         unmeasured: names of states, NaN in the episodes.
         raw: dt of the data, s.
+        required: refuse a state that cannot be estimated, else leave it NaN.
 
     Returns:
         Episodes of at least `MIN_ROWS` rows, and what was done.
@@ -89,7 +92,15 @@ def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tupl
         for name in unmeasured
         if (measured := [p for p in relations.get(name, []) if p not in unmeasured])
     }
-    drives = {name: _driven(model, name, unmeasured, relations, source) for name in unmeasured if name not in source}
+    drives: dict[str, Drive] = {}
+    left = []
+    for name in [name for name in unmeasured if name not in source]:
+        try:
+            drives[name] = _driven(model, name, unmeasured, relations, source)
+        except DataError:
+            if required:
+                raise
+            left.append(name)
     long = [episode for episode in episodes if len(episode.time) >= MIN_ROWS]
     if not long:
         raise DataError(f"too few rows: {', '.join(unmeasured)} cannot be estimated, no segment has {MIN_ROWS} rows.")
@@ -102,6 +113,7 @@ def estimate_speeds(model: Source, episodes: Sequence[Episode], unmeasured: tupl
             episode.states[:, v] = _slope(episode.time, episode.states[:, p], lam, raw)
         noise[name] = (position, slope_noise(lam) / raw)
         done.append(f"{name} = d({position})/dt of a smoothing spline (window about {lam**0.25 * raw:.2g} s, by GCV)")
+    done += [f"{name} left open: no measured state has it as its time derivative" for name in left]
     leans = False
     for name, found in drives.items():
         assert isinstance(model, Model)  # of a world nothing is known that could be solved
