@@ -30,7 +30,9 @@ def searched(gain: str) -> Search:
     ).model()  # fmt: skip
     random = np.random.default_rng(0)
     episodes = tuple(
-        Episode(f"{k}", np.arange(12) * 0.1, random.normal(size=(12, 2)), random.normal(size=(12, 1)), np.zeros((12, 0)))
+        Episode(
+            f"{k}", np.arange(12) * 0.1, random.normal(size=(12, 2)), random.normal(size=(12, 1)), np.zeros((12, 0))
+        )
         for k in range(4)
     )
     recording = Recording(episodes[:3], episodes[3:], (), {"s": 0.1, "v": 0.1}, (), (Check("c", True, ""),), ())

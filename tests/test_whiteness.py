@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.whiteness import autocorrelation, cumulated_periodogram
+from simpel_cli.discovery.whiteness import autocorrelation, cumulated_periodogram, memory
 
 
 def test_autocorrelation_of_an_autoregression() -> None:
@@ -57,3 +57,14 @@ def test_white_signals_stay_in_the_bands() -> None:
 def test_too_little_says_nothing(pieces: list[np.ndarray]) -> None:
     assert autocorrelation(pieces) is None
     assert cumulated_periodogram(pieces) is None
+
+
+def test_errors_that_follow_each_other_are_told_from_white_ones() -> None:
+    random = np.random.default_rng(0)
+    white = random.normal(size=(5, 60))
+    slow = np.sin(0.3 * np.arange(60))[None] + 0.5 * white
+    assert memory(white) is None
+    assert memory(-np.diff(white, axis=1)) is None  # of a differentiated column: the next error is opposite
+    assert memory(slow) == pytest.approx(0.6, abs=0.15)
+    white[:, ::7] = np.nan
+    assert memory(white) is None

@@ -95,6 +95,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         gates,
         before,
         after,
+        assessor(selection.chosen.optimum.z, plan.windows),
         windows,
         study.recording.checks,
         options.horizon,

@@ -176,14 +176,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             for j in range(ny):
                 c = slope[j]
                 gain = apart(product(cov, c[:, None])[:, 0])
-                s = jnp.sum(c * gain, axis=0) + noise.r[j] ** 2
+                s = product(c[None], gain[:, None])[0, 0] + noise.r[j] ** 2
                 e = y_k[j] - h_k[j]
-                e = (jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e) - jnp.sum(c * (x - predicted), axis=0)
-                weight = ok_k[j] / s
+                e = jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e
+                e = e - product(c[None], (x - predicted)[:, None])[0, 0]
+                weight, pull = apart((ok_k[j] / s, ok_k[j] * e / s))
                 errors.append(e)
                 variances.append(s)
-                x = x + gain * (weight * e)[None]
-                cov = cov - weight[None, None] * (gain[:, None] * gain[None])
+                x = x + gain * pull[None]
+                cov = cov - (weight[None] * gain)[:, None] * gain[None]
                 x, cov = apart((x, cov))
             following, jacobian, rate, rate_x = flow(given, x, u_k)
             after = product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half

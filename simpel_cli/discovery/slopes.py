@@ -5,7 +5,7 @@ derivatives are made once per point, and a direction costs a few products with t
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi
 import jax
@@ -34,8 +34,8 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
     n, nx = result.numel(), x.numel()
     values = casadi.densify(casadi.vertcat(result, casadi.vec(casadi.jacobian(result, x).T)))
     in_x, in_u, in_p = (casadi.jacobian(values, v) for v in (x, u, p))
-    moved = sorted(set(in_p.sparsity().row()))  # the rows of `values` that parameters change at all
-    in_p = casadi.densify(in_p[moved, :]) if moved else casadi.SX(0, p.numel())
+    blocks = _blocks(_places(in_p), n, nx)
+    in_p = casadi.vertcat(*(casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks))
     names = ["x", "u", "p"]
     ranges = [
         [(q.low, q.high) for q in group] for group in (augmented.model.states, augmented.model.inputs, augmented.params)
@@ -43,7 +43,7 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
     checked(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]), ranges)
     # jit within jit: the lists of instructions are walked once, not in every program that uses them
     value = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"])))
-    slopes = [values, in_x, in_u, casadi.vec(in_p.T)]
+    slopes = [values, in_x, in_u, in_p]
     with_all = casadi.Function("slopes", [x, u, p], casadi.cse(slopes), names, ["v", "by_x", "by_u", "by_p"])
     all_of = jax.jit(to_jax_rows(with_all))
     places_x, places_u = _places(in_x), _places(in_u)
@@ -62,12 +62,17 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
         for places, slope, tangent in ((places_x, by_x, tx), (places_u, by_u, tu)):
             for k, (i, j) in enumerate(places):
                 sums[i] = sums[i] + slope[k] * tangent[j]
-        if moved:
-            # beyond the last row: the padding, which moves nothing
-            table = by_p.reshape(len(moved), p.shape[0], *p.shape[1:])
-            column = jnp.take_along_axis(table, jnp.minimum(row, p.shape[0] - 1)[None, None], axis=1)[:, 0]
-            step = jnp.where(row < p.shape[0], moved_by, 0.0)
-            for k, i in enumerate(moved):
+        begin = 0
+        for block in blocks:
+            shape = len(block.rows), len(block.columns)
+            table = by_p[begin : begin + shape[0] * shape[1]].reshape(*shape, *p.shape[1:])
+            begin += shape[0] * shape[1]
+            place = np.full(p.shape[0] + 1, -1)  # the last one is the padding, which moves nothing
+            place[block.columns] = np.arange(shape[1])
+            at = jnp.asarray(place)[jnp.minimum(row, p.shape[0])]
+            column = jnp.take_along_axis(table, jnp.maximum(at, 0)[None, None], axis=1)[:, 0]
+            step = jnp.where(at >= 0, moved_by, 0.0)
+            for k, i in enumerate(block.rows):
                 sums[i] = sums[i] + column[k] * step
         return v, jnp.stack([jnp.broadcast_to(s, v.shape[1:]) for s in sums])
 
@@ -76,6 +81,25 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
         return v[:n], v[n:].reshape(n, nx, *v.shape[1:])
 
     return point
+
+
+class _Block(NamedTuple):
+    """Parameters that act on the same results, and the rows of values and slopes that any of them changes."""
+
+    rows: list[int]
+    columns: list[int]
+
+
+def _blocks(places: list[tuple[int, int]], n: int, nx: int) -> list[_Block]:
+    """Gather parameters by the results that they act on: most act on one, and all other rows would be zeros."""
+    rows_of: dict[int, set[int]] = {}
+    for i, j in places:
+        rows_of.setdefault(j, set()).add(i)
+    groups: dict[frozenset[int], list[int]] = {}
+    for j, rows in sorted(rows_of.items()):
+        results = frozenset(i if i < n else (i - n) // nx for i in rows)
+        groups.setdefault(results, []).append(j)
+    return [_Block(sorted(set().union(*(rows_of[j] for j in group))), group) for group in groups.values()]
 
 
 def _places(matrix: casadi.SX) -> list[tuple[int, int]]:

@@ -9,8 +9,10 @@ from simpel_cli.discovery.assess import Assessment, reduction_interval, results,
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
 from simpel_cli.discovery.twins import twins
+from simpel_cli.discovery.whiteness import memory
 from simpel_cli.discovery.windows import Windows
 from simulators.effects import Term
+from simulators.effects.expression import per
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
@@ -23,6 +25,7 @@ def verdict_of(
     gates: list[Gate],
     before: Assessment,
     after: Assessment,
+    learnt: Assessment,
     windows: Windows,
     checks: tuple[Check, ...],
     horizon: int,
@@ -36,6 +39,7 @@ def verdict_of(
         gates: one per chosen term, in order.
         before: the calibrated simulator on the test windows.
         after: the corrected one.
+        learnt: the corrected one on the windows that it was fitted to.
         windows: the test windows.
         checks: of the data.
         horizon: rows.
@@ -46,7 +50,7 @@ def verdict_of(
         not any(terms[t.terms[-1]].depends_on for t in rivals) for rivals in selection.classes
     ]  # not beaten by a function without a name
     effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i, ok in enumerate(named) if ok]
-    remainder = _remainder(search, selection, named)
+    remainder = _remainder(search, selection, named) or _followed(search, selection.chosen, learnt)
     different = [_distinct(e) for e in effects]
     if not effects:
         kind = UNEXPLAINED if remainder else NONE
@@ -159,6 +163,31 @@ def _remainder(search: Search, selection: Selection, named: list[bool]) -> dict[
         "log_evidence_gain": gain,
         "description": f"something acts on d({term.acts_on})/dt that depends on {', '.join(term.depends_on)} and is "
         f"no effect of the catalogue (typical rate of the data: {scale:.3g} {unit})",
+    }
+
+
+def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, Any] | None:
+    """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
+    errors = learnt.one_step / np.sqrt(learnt.variance)
+    found = {
+        name: r for j, name in enumerate(search.plan.augmented.measured) if (r := memory(errors[:, :, j])) is not None
+    }
+    if not found:
+        return None
+    worst = max(found, key=lambda name: found[name])
+    model, roles = search.plan.augmented.model, search.plan.augmented.roles
+    speed = {position: velocity for velocity, position in roles.velocity.items() if position}
+    acts_on = speed.get(worst, worst)
+    unit = next((per(q.unit, "s") for q in model.states if q.name == acts_on), "")
+    return {
+        "acts_on": acts_on,
+        "depends_on": ["time"],
+        "rms": _noise(search, chosen)[1] / np.sqrt(model.dt),
+        "unit": unit,
+        "log_evidence_gain": None,
+        "description": f"something acts on d({acts_on})/dt that is no function of the states and inputs of the model: the "
+        f"one-step errors of {worst} follow each other (correlation {found[worst]:.2f} from row to row); it depends on "
+        "time, or on what was not recorded",
     }
 
 

@@ -14,6 +14,7 @@ import numpy as np
 Z95 = 1.959963984540054
 KOLMOGOROV95 = 1.3581  # quantile of the supremum of a Brownian bridge
 LAGS = 20
+MEMORY_NATS, MEMORY_LEAST = 12.0, 0.2  # n r_1^2/2, and r_1, from which on errors are said to follow each other
 
 
 class Correlation(NamedTuple):
@@ -81,3 +82,19 @@ def cumulated_periodogram(episodes: Sequence[np.ndarray]) -> Cumulated | None:
     order = np.argsort(frequency, kind="stable")
     total = np.cumsum(power[order])
     return Cumulated(frequency[order], total / total[-1], KOLMOGOROV95 / np.sqrt(len(frequency)))
+
+
+def memory(errors: np.ndarray) -> float | None:
+    """Return the correlation of each one-step error with the next where it is large and positive, else None.
+
+    A force that the filter has to follow row after row, since it is no function of states or inputs, leaves such errors;
+    process noise that is white does not.
+
+    Args:
+        errors: (W, T) standardised, windows by rows.
+    """
+    found = autocorrelation(list(errors), 1)
+    if found is None:
+        return None
+    n, r = int(np.isfinite(errors).sum()), float(found.value[0])
+    return r if r > MEMORY_LEAST and n * r**2 / 2 > MEMORY_NATS else None
