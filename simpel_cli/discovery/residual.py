@@ -118,7 +118,8 @@ class Forces:
         """Return where the model takes every state, (W, T, nx), in one row."""
         p, _ = self.coordinates.physical(jnp.asarray(z))
         u = np.asarray(self._arriving(p, jnp.asarray(windows.u)))
-        x, u = state.reshape(-1, state.shape[-1]), u.reshape(-1, *u.shape[2:])
+        rows_in_all = state.shape[0] * state.shape[1]
+        x, u = state.reshape(rows_in_all, -1), u.reshape(rows_in_all, *u.shape[2:])
         parts = []
         for begin in range(0, len(x), CHUNK):
             rows = np.minimum(np.arange(begin, begin + CHUNK), len(x) - 1)

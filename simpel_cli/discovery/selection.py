@@ -12,6 +12,7 @@ import numpy as np
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
 from simpel_cli.discovery.screen import promises
 from simpel_cli.discovery.setup import Setup
+from simpel_cli.errors import DataError
 from simulators.effects import Term
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
@@ -115,6 +116,13 @@ class Search:
             z[:n] = random.uniform(0.1, 0.9, n)
             starts.append(z)
         found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
+        if not any(np.isfinite(o.log_evidence) for o in found):
+            raise DataError(
+                f"sim: no parameters within the ranges of {self.plan.augmented.model.name} gave the measurements a finite "
+                f"likelihood, in {STARTS} tries: its states run away or its rates are not finite. Simulate it from a "
+                "measured start (`simpel simulate`), narrow sim.parameters, or guard roots, logarithms and divisions "
+                "with max(., 1e-9)."
+            )
         return self.best((), found)
 
     def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:

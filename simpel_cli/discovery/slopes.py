@@ -42,15 +42,26 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
     ]
     checked(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]), ranges)
     # jit within jit: the lists of instructions are walked once, not in every program that uses them
-    value = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"])))
+    plain = to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]))
     slopes = [values, in_x, in_u, in_p]
     with_all = casadi.Function("slopes", [x, u, p], casadi.cse(slopes), names, ["v", "by_x", "by_u", "by_p"])
-    all_of = jax.jit(to_jax_rows(with_all))
+    every = to_jax_rows(with_all)
+
+    @jax.jit
+    def value(x: Array, u: Array, p: Array) -> Array:
+        v = plain(x, u, p)[0]
+        return jnp.concatenate([v[:n], _finite(v[n:])])
+
+    @jax.jit
+    def all_of(x: Array, u: Array, p: Array) -> tuple[Array, ...]:
+        v, *slopes = every(x, u, p)
+        return jnp.concatenate([v[:n], _finite(v[n:])]), *map(_finite, slopes)
+
     places_x, places_u = _places(in_x), _places(in_u)
 
     @jax.custom_jvp
     def flat(x: Array, u: Array, p: Array, row: Array, moving: Array) -> Array:
-        return value(x, u, p)[0]
+        return value(x, u, p)
 
     @flat.defjvp
     def _(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
@@ -81,6 +92,11 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
         return v[:n], v[n:].reshape(n, nx, *v.shape[1:])
 
     return point
+
+
+def _finite(slopes: Array) -> Array:
+    """The slope of sqrt(max(h, 0)) at an empty tank is infinite or nan: there it counts as zero."""
+    return jnp.where(jnp.isfinite(slopes), slopes, 0.0)
 
 
 class _Block(NamedTuple):
