@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from simpel_cli.commands.close import close, memory_of
 from simpel_cli.commands.discover_show import publish
@@ -14,21 +15,27 @@ from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump
 from simpel_cli.console import Terminal
 from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.cleaned import Cleaned, cleaned, outlier_check
 from simpel_cli.discovery.corrected import corrected
 from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gate
 from simpel_cli.discovery.next_experiment import next_experiment
-from simpel_cli.discovery.selection import Search, Selection
+from simpel_cli.discovery.outliers import gated, without_new
+from simpel_cli.discovery.selection import Search, Selection, Trial
 from simpel_cli.discovery.settings import Discovery
-from simpel_cli.discovery.setup import setup, test_windows
+from simpel_cli.discovery.setup import Setup, setup, test_windows
+from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, verdict_of
-from simpel_cli.errors import ConfigError, Inconclusive
+from simpel_cli.discovery.windows import Windows
+from simpel_cli.errors import ConfigError, Inconclusive, NumericsError
 from simpel_cli.nodes import build
-from simpel_cli.records import write_table, write_text
+from simpel_cli.records import strict, write_table, write_text
 from simpel_cli.run import Manifest, make_directory, refuse_occupied
 from simulators.effects import Expression
 from simulators.model import Model
+
+MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
 def discover(job: Job, *, strict: bool = False) -> None:
@@ -70,24 +77,27 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     options: Discovery = build(config.get("discovery") or {}, "discovery", default=Discovery)
     effects = effects_of(config.get("effect"), study.settings.plugins)
     terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
-    bad = [c for c in study.recording.checks if not c.ok]
-    terminal.line(
-        "; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(study.recording.checks)} ok", "data"
-    )
+    declared_noise = tuple(study.measurements.noise_std)
+    clean = cleaned(study.recording, model, declared_noise)
+    recording = clean.recording
+    bad = [c for c in recording.checks if not c.ok]
+    terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")
     plan = setup(
         model,
-        study.recording,
-        tuple(study.measurements.noise_std),
+        recording,
+        declared_noise,
         effects,
         options.substeps,
     )
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
-    search = Search(plan, fitter, lambda text: terminal.line(text, "search"))
-    selection = search.run()
     assessor = Assessor(plan, options.horizon)
+    search, base, windows, clean = _calibrated(plan, fitter, assessor, clean, terminal)
+    outliers = outlier_check(clean, plan.augmented.measured)
+    terminal.line(outliers.detail, "outliers")
+    recording = recording._replace(checks=(*recording.checks, outliers))
+    selection = search.run(base)
     selection, gates = _gated(search, assessor, selection, terminal)
-    windows = test_windows(plan, study.recording.test, study.recording.outputs)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,
@@ -97,10 +107,14 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         after,
         assessor(selection.chosen.optimum.z, plan.windows),
         windows,
-        study.recording.checks,
+        recording.checks,
         options.horizon,
         time.perf_counter() - began,
     )
+    found["not_tested"] = unseen(search, selection.chosen, recording.train)
+    unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
+    found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
+    found["summary"] += caveats(found)
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
@@ -116,12 +130,36 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         }
         if config.get("close", True) and len(left_out) < len(found["effects"]):
             found["as_prior"] = close(config, node, directory, data_folder, terminal)
-    write_text(directory / "verdict.json", json.dumps(found, indent=1))
-    shown = exhibits(search, selection, assessor, study.recording, windows, before, after)
+    write_text(directory / "verdict.json", json.dumps(strict(found), indent=1, allow_nan=False))
+    shown = exhibits(search, selection, assessor, recording, windows, before, after)
     for name, table in shown.items():
         write_table(directory / f"{name}.parquet", table.columns, table.units)
     publish(terminal, found, directory, config)
     return found
+
+
+def _calibrated(
+    plan: Setup, fitter: Fitter, assessor: Assessor, clean: Cleaned, terminal: Terminal
+) -> tuple[Search, Trial, Windows, Cleaned]:
+    """Calibrate the simulator, and again as long as values stand out that it does not have to follow."""
+    recording, names = clean.recording, plan.augmented.measured
+    cut = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
+    told = lambda text: terminal.line(text, "search")  # noqa: E731
+    for _ in range(MOST_CALIBRATIONS):
+        search = Search(plan._replace(windows=cut["train"]), fitter.on(cut["train"]), told)
+        base = search.base()
+        if not np.isfinite(base.optimum.log_evidence):
+            raise NumericsError(
+                "discover: the simulator cannot be calibrated: from no start the filter's likelihood is finite. Compare the "
+                "columns with the declared ranges (data checks above), or set discovery.substeps: 4 for a stiff simulator."
+            )
+        after = {split: gated(assessor, base.optimum.z, windows) for split, windows in cut.items()}
+        clean, after = without_new(clean, cut, after, names)
+        same = np.array_equal(after["train"].ok, cut["train"].ok)
+        cut = after
+        if same:
+            break
+    return search, base, cut["test"], clean
 
 
 def _gated(

@@ -8,6 +8,7 @@ import numpy as np
 from simpel_cli.commands.discover_report import HORIZONS, reliable, rows_of, sections_of, untested, words
 from simpel_cli.config import dump, load
 from simpel_cli.console import Terminal
+from simpel_cli.discovery.unseen import in_words
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import write_report
 
@@ -63,7 +64,7 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     if small:
         more = len(good) - MOST_NAMED
         terminal.line(f"Not found, and smaller than: {small}" + (f" · {more} more in the report" if more > 0 else ""))
-    outside = untested(columns_of(directory / "coverage.parquet"))
+    outside = untested(columns_of(directory / "coverage.parquet")) + in_words(found.get("not_tested", []))
     if outside:
         terminal.line(f"Not tested by these data: {', '.join(outside)}")
     terminal.line(f"{found['candidates_tried']} candidates, {found['seconds']:.0f} s", "time")

@@ -47,7 +47,14 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
     keep = good.all(axis=1) & (rows.episode != "")
     dropped = len(keep) - int(keep.sum())
     if dropped == len(keep):
-        raise DataError("no row is complete: every one has NaN, inf or nothing in one of its columns.")
+        empty = [name for name, column in zip(names, good.T, strict=True) if not column.any()]
+        which = (
+            f"'{empty[0]}' has no number at all" if empty else "every one has NaN, inf or nothing in one of its columns"
+        )
+        raise DataError(
+            f"no row is complete: {which}. If it was not measured, say `columns: {{<state>: null}}`; "
+            "an input must be measured."
+        )
     if dropped == 0:
         return Check("finite", True, f"all {len(keep)} rows{note}"), rows
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"

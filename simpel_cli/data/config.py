@@ -40,6 +40,8 @@ class Measurements:
         stack_actions: number of past inputs that a transition carries along.
         max_gap: s; a longer distance between two rows cuts the episode; null = 1.5 dt, of the data or, if that is longer,
             of what they are resampled to.
+        derived: states whose column was computed from another column, e.g. a speed that was differentiated from the
+            position: `discover` does not take them for measurements. A plain difference is found without this.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
@@ -60,6 +62,7 @@ class Measurements:
     units: Mapping[str, str] = field(default_factory=dict)
     stack_actions: int = 0
     max_gap: float | int | None = None
+    derived: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.paths or not all(isinstance(path, str) and path for path in self.paths):
@@ -112,6 +115,7 @@ class Measurements:
             ("columns", self.columns, quantities),
             ("units", self.units, quantities),
             ("noise_std", self.noise_std, measurable),
+            ("derived", self.derived, measurable),
         ):
             for name in names:
                 if name not in allowed:

@@ -8,7 +8,7 @@ import numpy as np
 from simpel_cli.data import checks, sensor_checks
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.files import by_file, locate
-from simpel_cli.data.kinematics import Motion, derived, kinematics
+from simpel_cli.data.kinematics import Motion, derived, differences, kinematics
 from simpel_cli.data.noise import third_difference_std
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
@@ -58,9 +58,10 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
+        computed: tuple[str, ...] = config.derived
     else:
         report.append(checks.monotonic(rows, table, config))
-        parts, noise, more = _trajectories(config, model, rows, mapping, whole)
+        parts, noise, more, computed = _trajectories(config, model, rows, mapping, whole)
         report += more
     for part, episodes in parts.items():
         if not episodes:
@@ -73,17 +74,19 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         estimated=mapping.unmeasured,
         checks=tuple(report),
         files=(*paths, *cards),
+        derived=tuple(name for name in computed if name in mapping.columns),
     )
 
 
 def _trajectories(
     config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool
-) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check]]:
-    """Episodes by split, noise by quantity, checks."""
+) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
+    """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
     sampling, raw = checks.sampling(rows, model, config)
     gaps, starts = checks.gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
-    report = [sampling, gaps, *_sensors(config, model, mapping, [episode for _, episode in tagged], raw)]
+    faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
+    report = [sampling, gaps, *faults]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
@@ -101,11 +104,13 @@ def _trajectories(
     }
     kept, short = _long_enough(config, model, episodes)
     report += [short, _noise_check(config, model, noise)]
-    return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report
+    return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report, computed
 
 
-def _sensors(config: Measurements, model: Source, mapping: Mapping, segments: list[Episode], dt: float) -> list[Check]:
-    """Faults of the sensors and the clock, of the rows as they were measured."""
+def _sensors(
+    config: Measurements, model: Source, mapping: Mapping, segments: list[Episode], dt: float
+) -> tuple[list[Check], tuple[str, ...]]:
+    """Faults of the sensors and the clock, of the rows as they were measured, and columns that are no measurement."""
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
     columns = {
         q.name: [np.concatenate([s.states, s.outputs], axis=1)[:, i] for s in segments]
@@ -120,13 +125,14 @@ def _sensors(config: Measurements, model: Source, mapping: Mapping, segments: li
         for p in positions
         if p in columns and v in columns
     ]
-    return [
+    found = [
         sensor_checks.jitter(times, dt, model.dt if config.resample is None else None),
         sensor_checks.stale(columns),
         sensor_checks.quantisation(columns, units),
         kinematics(motions),
-        derived(motions),
+        derived(motions, config.derived),
     ]
+    return found, tuple(dict.fromkeys([*config.derived, *differences(motions)]))
 
 
 def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:

@@ -46,6 +46,7 @@ class Recording(NamedTuple):
     estimated: tuple[str, ...]  # names of the states that were not measured
     checks: tuple[Check, ...]
     files: tuple[Path, ...]  # what was read
+    derived: tuple[str, ...] = ()  # names of the states whose column was computed from another one's
 
 
 class Transitions(NamedTuple):

@@ -12,6 +12,7 @@ Reference: Levenberg (1944), Marquardt (1963); Kass and Raftery (1995), Bayes fa
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -119,6 +120,12 @@ class Fitter:
                     old[chunk] = new[: len(chunk)]
             waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
         return [self._optimum(state, i, lane.free) for i, lane in enumerate(hypotheses)]
+
+    def on(self, windows: Windows) -> "Fitter":
+        """Return the same fitter for windows of the same shape; it shares the compiled program."""
+        other = copy(self)
+        other.windows, other._data = windows, tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
+        return other
 
     def _begin(self, lanes: Sequence[Lane]) -> Course:
         padding = len(self.coordinates.low) - 1

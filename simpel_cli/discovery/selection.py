@@ -169,9 +169,9 @@ class Search:
         """Terms that can still be added."""
         return [t for t in range(len(self.terms)) if t not in terms and self.fits((*terms, t))]
 
-    def run(self) -> Selection:
-        """Search."""
-        current = base = self.base()
+    def run(self, base: Trial | None = None) -> Selection:
+        """Search, from the calibrated simulator if it is known already."""
+        current = base = base or self.base()
         path, stages = [base], []
         remainder = None
         self.told("calibrated")
@@ -193,7 +193,7 @@ class Search:
             unnamed = next((t for t in trials if self.terms[t.terms[-1]].depends_on), None)
             gain = best.optimum.log_evidence - current.optimum.log_evidence if best else -np.inf
             gain_unnamed = unnamed.optimum.log_evidence - current.optimum.log_evidence if unnamed else -np.inf
-            if best is None or gain <= ACCEPT or len(current.terms) == MOST_EFFECTS:
+            if best is None or not gain > ACCEPT or len(current.terms) == MOST_EFFECTS:
                 if unnamed is not None and gain_unnamed > ACCEPT:
                     remainder = (self.terms[unnamed.terms[-1]], float(gain_unnamed))
                 break

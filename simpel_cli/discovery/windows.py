@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.data.recording import Episode
+from simpel_cli.errors import DataError
 
+LEAST = 3  # rows of a window: a start, and one that it predicts, and one that confirms it
 LONGEST = 256  # rows of a window: a longer record is cut, and its windows run side by side
 LONGEST_TEST = 2048  # of a window on which free runs are judged
 
@@ -76,7 +78,7 @@ def windows_of(
         past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
         for begin in range(0, len(y), length):
             part = y[begin : begin + length]
-            if len(part) < 3:
+            if len(part) < LEAST:
                 continue
             ok = np.isfinite(part)
             missing = length - len(part)
@@ -91,4 +93,10 @@ def windows_of(
             rows["start"].append(start)
             rows["spread"].append(spread)
             rows["episode"].append(np.array(index))
+    if not rows["y"]:
+        raise DataError(
+            f"data: none of {len(episodes)} episodes ({', '.join(e.name for e in episodes[:3])}"
+            f"{', ...' if len(episodes) > 3 else ''}) has {LEAST} rows in a row, and discover follows episodes in time. Record "
+            "longer episodes, or choose others to test on (data.split)."
+        )
     return Windows(*(np.stack(rows[name]) for name in Windows._fields))

@@ -1,12 +1,13 @@
 """A velocity that is not the rate of its position, or is nothing but that rate, is found and named."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_sensor_checks import check, measured, motion
 
-from simpel_cli.data.kinematics import Motion, agreement, derived, difference_kind, kinematics
+from simpel_cli.data.kinematics import Motion, agreement, derived, difference_kind, differences, is_filtered, kinematics
 
 RNG = np.random.default_rng(0)
 
@@ -133,3 +134,39 @@ def test_both_are_shown_for_a_file(tmp_path: Path) -> None:
     degrees = measured(tmp_path, [a, a], [np.degrees(w)] * 2)
     assert "degrees per s" in check(degrees, "kinematics").detail
     assert check(measured(tmp_path, [a, a], [w, w]), "kinematics").ok
+
+
+def savitzky(p: np.ndarray, dt: float) -> np.ndarray:
+    from scipy.signal import savgol_filter
+
+    return np.asarray(savgol_filter(p, 7, 2, deriv=1, delta=dt))
+
+
+def averaged(p: np.ndarray, dt: float) -> np.ndarray:
+    return np.convolve(np.gradient(p, dt), np.ones(5) / 5, mode="same")
+
+
+@pytest.mark.parametrize("smooth", [savitzky, averaged])
+@pytest.mark.parametrize("noise", [0.001, 0.03])
+def test_a_smoothed_difference_is_found(smooth: Callable, noise: float) -> None:
+    t = 0.02 * np.arange(400)
+    p = motion(t)[0] + RNG.normal(0, noise, 400)
+    found = Motion("a", "w", "rad/s", [(t, p, smooth(p, 0.02))])
+    assert difference_kind(found) is None
+    assert differences([found]) == {"w": "the smoothed difference of a"}
+
+
+@pytest.mark.parametrize("per_swing", [3, 5, 10, 100, 1000])
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (0.01, 0.0), (0.01, 1e-4), (0.001, 0.03)])
+def test_a_velocity_of_its_own_is_no_smoothed_difference(per_swing: int, noise: tuple[float, float]) -> None:
+    t = 2 * np.pi / 3 / per_swing * np.arange(max(300, 3 * per_swing))
+    p, v = (x + RNG.normal(0, s, len(t)) if s else x for x, s in zip(motion(t), noise, strict=True))
+    assert not is_filtered(Motion("a", "w", "rad/s", [(t, p, v)]))
+
+
+def test_a_declared_one_is_no_news() -> None:
+    t = 0.02 * np.arange(400)
+    p = motion(t)[0] + RNG.normal(0, 0.01, 400)
+    found = derived([Motion("a", "w", "rad/s", [(t, p, np.gradient(p, t))])], ["w"])
+    assert found.ok
+    assert found.detail == "w: declared as computed from other columns"

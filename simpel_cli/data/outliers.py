@@ -1,0 +1,115 @@
+"""Single values of a sensor that stand out from their neighbours, found without a model.
+
+    d[k] = y[k] - (-y[k-2] + 4 y[k-1] + 4 y[k+1] - y[k+2])/6        (zero on any cubic)
+    l[k] = y[k] - polynomial through the rows before k,    r[k] the same through the rows after k
+
+A value is left out if |d| is far beyond what is usual for the channel, and neither the rows before it nor those after it
+lead there. A jump, an impact, a stop or a switched input has two sides, and each of its values belongs to one of them.
+What a spike of an input may have caused is not judged.
+
+Reference: Hampel (1974), The influence curve and its role in robust estimation (median absolute deviation).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from simpel_cli.data.sensor_checks import quantum
+
+FAR = 6.0  # usual deviations
+ROBUST = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+SHARE = (0.5, 1.6)  # of d: what l and r of a lone value are, with noise
+TRUST = 2.0  # times what the same polynomial missed the two rows before by
+PASSES = 5  # one value can hide another one beside it
+EXTRAPOLATE = {1: (2.0, -1.0), 2: (3.0, -3.0, 1.0), 3: (4.0, -6.0, 4.0, -1.0)}  # weights of the nearest row first
+KICK = 0.2  # of the span of an input: a smaller spike of it is none
+
+
+def lone_values(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Find values of one channel that stand alone.
+
+    Args:
+        pieces: contiguous rows at equal steps, angles unwrapped, each (T,).
+        inputs: of the same rows, held from a row to the next, each (T, nu).
+
+    Returns:
+        A mask (T,) per piece.
+    """
+    pieces = [np.array(piece, float) for piece in pieces]
+    blind = _after_kicks(inputs)
+    found = [np.zeros(len(piece), bool) for piece in pieces]
+    if not pieces:
+        return found
+    step = quantum(pieces)
+    for _ in range(PASSES):
+        news = _one_pass(pieces, blind, 0.0 if np.isnan(step) else step)
+        if not any(new.any() for new in news):
+            break
+        for piece, mask, new in zip(pieces, found, news, strict=True):
+            piece[new] -= _middle(piece)[new]
+            mask |= new
+    return found
+
+
+def _one_pass(pieces: Sequence[np.ndarray], blind: Sequence[np.ndarray], step: float) -> list[np.ndarray]:
+    middle = [_middle(piece) for piece in pieces]
+    usual = max(_usual(middle), step)
+    sides = {m: [(_side(p, w), _side(p[::-1], w)[::-1]) for p in pieces] for m, w in EXTRAPOLATE.items()}
+    # noise asks for a low order, a fast motion for a high one
+    order = min(sides, key=lambda m: _usual([left for left, _ in sides[m]]))
+    if not usual > 0:
+        return [np.zeros(len(p), bool) for p in pieces]
+    return [
+        (np.abs(d) > FAR * usual) & ~unseen & _leads_elsewhere(left, d) & _leads_elsewhere(right[::-1], d[::-1])[::-1]
+        for d, (left, right), unseen in zip(middle, sides[order], blind, strict=True)
+    ]
+
+
+def _middle(y: np.ndarray) -> np.ndarray:
+    """Distance of every value from the cubic through its four neighbours; 0 at the ends."""
+    d = np.zeros(len(y))
+    if len(y) > 4:
+        d[2:-2] = y[2:-2] - (-y[:-4] + 4 * y[1:-3] + 4 * y[3:-1] - y[4:]) / 6
+    return d
+
+
+def _side(y: np.ndarray, weights: Sequence[float]) -> np.ndarray:
+    """Distance of every value from the polynomial through the rows before it; NaN where there are too few."""
+    m = len(weights)
+    out = np.full(len(y), np.nan)
+    if len(y) > m:
+        out[m:] = y[m:] - sum(w * y[m - 1 - j : len(y) - 1 - j] for j, w in enumerate(weights))
+    return out
+
+
+def _leads_elsewhere(side: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Whether the rows before miss a value as a lone one is missed, and did not miss those before it alike."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = side / d
+    before = np.full((2, len(side)), np.nan)
+    before[0, 1:], before[1, 2:] = side[:-1], side[:-2]
+    missed = np.max(np.abs(np.nan_to_num(before, nan=np.inf)), axis=0)
+    return np.asarray((share > SHARE[0]) & (share < SHARE[1]) & (np.abs(side) > TRUST * missed))
+
+
+def _usual(signals: Sequence[np.ndarray]) -> float:
+    values = np.concatenate(signals)
+    values = np.abs(values[np.isfinite(values)])
+    return ROBUST * float(np.median(values)) if len(values) else np.inf
+
+
+def _after_kicks(inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Rows up to two behind a row in which an input alone stands out: a fast state may have followed it."""
+    spans = np.ptp(np.concatenate(inputs), axis=0) if inputs else np.zeros(0)
+    blind = []
+    for u in inputs:
+        kicked = np.zeros(len(u), bool)
+        if len(u) > 2 and u.shape[1]:
+            rise, fall = u[1:-1] - u[:-2], u[1:-1] - u[2:]
+            alone = np.minimum(np.abs(rise), np.abs(fall)) > np.maximum(2 * np.abs(rise - fall), KICK * spans)
+            kicked[1:-1] = np.any(alone & (rise * fall > 0), axis=1)
+        late = np.zeros(len(u), bool)
+        late[1:] |= kicked[:-1]
+        late[2:] |= kicked[:-2]
+        blind.append(late)
+    return blind
