@@ -14,6 +14,7 @@ from simulators.model import Model
 MOST_SHARE = 0.05  # of a channel; more is not a few spikes, and leaving it out would choose the data
 SHOWN = 6  # places that a message names
 LAGS = 5
+FEW_ROWS = 30  # fewer tell nothing about a memory
 FAR_OUTSIDE = 100.0  # widths of the declared range: a range may be rough, but not so
 TURNS = 1000.0
 WHITE_QUANTILE = 0.999  # of the statistic that white noise has
@@ -116,6 +117,8 @@ def refuse_noise(recording: Recording, model: Model) -> None:
     periodic = {q.name for q in model.states if q.periodic}
     for name in names:
         pieces = [column(e, name, recording, model) for e in recording.train]
+        if sum(len(p) for p in pieces if len(p) > LAGS) < FEW_ROWS:
+            return
         # an angle without order runs away where it is unwrapped
         parts = [np.sin, np.cos] if name in periodic else [np.asarray]
         if any(not is_noise([part(p) for p in pieces], inputs) for part in parts):
@@ -182,7 +185,7 @@ def is_noise(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> bool
         for lag in range(3):
             moved = sum(float(u[: len(u) - lag] @ p[lag:]) for u, p in zip(own, centred, strict=True))
             followed.append(moved / scale)
-    return not followed or n * float(np.sum(np.square(followed))) <= chi2.ppf(WHITE_QUANTILE, len(followed))
+    return not followed or n * float(np.sum(np.square(followed))) <= float(chi2.ppf(WHITE_QUANTILE, len(followed)))
 
 
 def outlier_check(found: Cleaned, names: Sequence[str]) -> Check:
