@@ -43,7 +43,13 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
             meaning = f"some function of {argument}"
             terms.append(
                 Term(
-                    "unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,),
+                    "unnamed",
+                    name,
+                    RATE,
+                    text,
+                    knobs,
+                    meaning,
+                    depends_on=(argument,),
                     constants=() if turns else (size,),
                 )  # fmt: skip
             )
