@@ -11,7 +11,7 @@ SETS ?= 600
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench exam lock data clean reproduce-metrics_vs_n_train
+.PHONY: help install demo test test-slow lint format bench exam lock data real clean reproduce-metrics_vs_n_train
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -48,6 +48,9 @@ bench: install ## Measure scores and speed on the reference's arrays (needs SIMP
 
 exam: install ## Give `simpel discover` the blind exam (SETS=600; PySINDy beside it after: uv sync --group exam)
 	$(BIN)/python -m tests.exam --sets $(SETS) --out runs/exam/$$(date +%Y%m%d-%H%M%S)
+
+real: install ## Search the recordings for what their simulators lack (needs SIMPEL_SHARED)
+	$(BIN)/python -m tests.benchmarks.real --out runs/real/$$(date +%Y%m%d-%H%M%S)
 
 reproduce-metrics_vs_n_train: install ## Make the README's figure anew (36 fits)
 	$(BIN)/simpel sweep experiment=pendulum method=simpel,simpel_only_sim,fsvgd data.n_train=10,20,40,80 'run.seed=range(3)' \

@@ -1,0 +1,73 @@
+"""`simpel discover` on the recordings: `python -m tests.benchmarks.real --out DIR [--only emps ...]` (needs SIMPEL_SHARED).
+
+Every verdict as a row of a table, and the errors after each accepted effect.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+EXPERIMENTS = ("free_pendulum", "cascaded_tanks", "ball_drops", "emps", "rc_car")
+CLOSED = (
+    "free_pendulum",
+    "emps",
+    "rc_car",
+)  # the loop is closed on these: SimPEL with the old and the corrected simulator
+
+
+def run(name: str, out: Path) -> dict[str, Any]:
+    """Search one recording, unless that was done, and return its verdict."""
+    directory = out / name
+    if not (directory / "verdict.json").exists():
+        words = [
+            "discover",
+            f"experiment={name}",
+            f"close={str(name in CLOSED).lower()}",
+            f"hydra.run.dir='{directory}'",
+        ]
+        subprocess.run([sys.executable, "-m", "simpel_cli.main", *words], check=True)
+    return json.loads((directory / "verdict.json").read_text())
+
+
+def row(name: str, found: dict[str, Any]) -> str:
+    """Return the table's row of one recording: errors of every measured quantity before and after."""
+    before, after = found["error"]["before"], found["error"]["after"]
+    cells = []
+    for kind in ("one_step", "horizon", "free_run"):
+        pairs = [f"{q} {_short(before[kind][q])} -> {_short(after[kind][q])}" for q in before[kind]]
+        cells.append("<br>".join(pairs))
+    effects = ", ".join(f"{e['name']} on {e['acts_on']}" for e in found["effects"]) or "-"
+    rest = f"; left: depends on {', '.join(found['remainder']['depends_on'])}" if found["remainder"] else ""
+    return f"| {name} | {found['verdict']} | {effects}{rest} | " + " | ".join(cells) + f" | {found['seconds']:.0f} |"
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def main() -> None:
+    """Run the recordings and print the table."""
+    parser = argparse.ArgumentParser(prog="tests.benchmarks.real", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=list(EXPERIMENTS), choices=EXPERIMENTS)
+    options = parser.parse_args()
+    out = options.out.resolve()
+    lines = [
+        "| recording | verdict | effects | one step | 20 rows ahead | free run | seconds |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    sentences = []
+    for name in options.only:
+        found = run(name, out)
+        lines.append(row(name, found))
+        sentences.append(f"* {name}: {found['summary']}")
+    text = "\n".join([*lines, "", *sentences])
+    (out / "table.md").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
