@@ -26,7 +26,7 @@ from simpel_cli.discovery.selection import Search, Selection, Trial
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Setup, setup, test_windows
 from simpel_cli.discovery.unseen import caveats, unseen
-from simpel_cli.discovery.verdict import AMBIGUOUS, verdict_of
+from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
 from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.nodes import build
@@ -105,12 +105,13 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         gates,
         before,
         after,
-        assessor(selection.chosen.optimum.z, plan.windows),
+        assessor(selection.chosen.optimum.z, search.plan.windows),
         windows,
         recording.checks,
         options.horizon,
         time.perf_counter() - began,
     )
+    found["steps"] = steps_of(search, selection, assessor, windows)
     found["not_tested"] = unseen(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]

@@ -39,6 +39,7 @@ def sections_of(
         error_section(found, tables.get("errors", {})),
         equation_section(found, before, after),
         effect_section(found),
+        step_section(found),
         *pictures.values(),
         prior_section(found),
         parameter_section(found, tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
@@ -140,6 +141,31 @@ def marked(old: str, new: str) -> list[tuple[str, bool]]:
         if end > begin:
             pieces.append(("".join(b[begin:end]), kind != "equal"))
     return pieces
+
+
+def step_section(found: Mapping[str, Any]) -> Section:
+    """Errors after each accepted effect, where there is more than one."""
+    steps = found.get("steps") or []
+    if len(steps) < 3:
+        return {}
+    horizon = found["error"]["horizon_steps"]
+    names = list(steps[0]["error"]["horizon"])
+    rows = [
+        [" and ".join(words(label) for label in step["added"]) or "the calibrated simulator"]
+        + [_number(step["error"][kind].get(name)) for name in names for kind in ("horizon", "free_run")]
+        for step in steps
+    ]
+    head = [f"{name}, {kind}" for name in names for kind in (f"{horizon} rows ahead", "free run")]
+    return {
+        "title": "Step by step",
+        "head": ["added", *head],
+        "rows": rows,
+        "note": "RMSE on the test episodes after each effect was added, all parameters fitted anew.",
+    }
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
 
 
 def effect_section(found: Mapping[str, Any]) -> Section:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Check
-from simpel_cli.discovery.assess import Assessment, reduction_interval, results, rmse
+from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
 from simpel_cli.discovery.twins import twins
@@ -86,6 +86,18 @@ def verdict_of(
         "seconds": round(seconds, 2),
     }
     return found | {"summary": sentence(found, before, after, measured)}
+
+
+def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
+    """Return the errors on the test windows after each accepted effect, from the calibrated simulator on."""
+    measured = search.plan.augmented.measured
+    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    steps, before = [], set[int]()
+    for trial in selection.path:
+        added = [search.terms[t].label for t in trial.terms if t not in before]
+        before = set(trial.terms)
+        steps.append({"added": added, "error": results(assessor(trial.optimum.z, windows), measured, rows)})
+    return steps
 
 
 def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[str, float]:
