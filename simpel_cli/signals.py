@@ -1,4 +1,4 @@
-"""Inputs as they arrive: delayed and lagged, as means over the integrator's substeps.
+"""Inputs as they arrive: through a play, delayed and lagged, as means over the integrator's substeps.
 
 A held input is a staircase; its integral U(t) is piecewise linear, so the mean over a substep that lies d in the past,
 (U(t + h - d) - U(t - d))/h, is continuous in d, below one sample too.
@@ -17,6 +17,7 @@ def arriving(
     dt: float,
     substeps: int,
     lead: int,
+    half_play: Float[Array, " nu"] | None = None,
 ) -> Float[Array, "T substeps nu"]:
     """Return the input of every substep of the rows behind the lead.
 
@@ -27,7 +28,10 @@ def arriving(
         dt: distance of the rows, s.
         substeps: per row.
         lead: rows of the past.
+        half_play: half width of a play in front of the delay, in units of u, per input (see `play`); None: of no input.
     """
+    if half_play is not None:
+        u = play(u, half_play)
     rows = u.shape[0]
     h = dt / substeps
     integral = jnp.concatenate([jnp.zeros((1, u.shape[1]), u.dtype), jnp.cumsum(u, axis=0)]) * dt
@@ -56,3 +60,26 @@ def arriving(
 
     every = jax.vmap(one, in_axes=(1, 0, 0, 0), out_axes=1)(integral, u[0], delay, lag)
     return every.reshape(rows, substeps, -1)[lead:]
+
+
+def play(u: Float[Array, "R nu"], half: Float[Array, " nu"]) -> Float[Array, "R nu"]:
+    """Return what passes a backlash: the output stays until the input has crossed the play, then follows at its edge.
+
+        v_k = min(u_k + c, max(u_k - c, v_{k-1}))
+
+    Before the record the input is taken to lie in the middle of the play. The slope in c where c = 0 is that of a play that
+    begins to open: an edge that is only touched counts as reached, which min and max would leave half undecided.
+
+    Args:
+        u: inputs, row by row.
+        half: c, half width of the play, in units of u, per input; 0 = none.
+
+    Reference: Visintin (1994), Differential models of hysteresis, ch. III.2 (the play operator).
+    """
+
+    def row(before: Array, now: Array) -> tuple[Array, Array]:
+        low, high = now - half, now + half
+        after = jnp.where(before < low, low, jnp.where(before > high, high, before))
+        return after, after
+
+    return jax.lax.scan(row, u[0], u)[1]

@@ -17,7 +17,7 @@ import casadi
 
 Symbol: TypeAlias = Any  # casadi.SX or casadi.MX, which have no common base class
 
-MAX_LENGTH = 2000  # characters
+MAX_LENGTH = 10_000  # characters: a corrected car in the world frame has thousands
 MAX_DEPTH = 100  # nested nodes: each costs stack frames, and a sum of n terms is n deep
 
 

@@ -54,9 +54,14 @@ def plan() -> Setup:
     return setup(model(), recording(), (), [LOAD], 2)
 
 
-def p_of(plan: Setup, load: float = 0.0) -> np.ndarray:
+def p_of_plan(plan: Setup, *own: float) -> np.ndarray:
     p = plan.augmented.neutral.copy()
-    p[:2] = A, B
+    p[: len(own)] = own
+    return p
+
+
+def p_of(plan: Setup, load: float = 0.0) -> np.ndarray:
+    p = p_of_plan(plan, A, B)
     p[[q.name for q in plan.augmented.params].index("load_v_c")] = load
     return p
 
@@ -100,6 +105,31 @@ def test_the_likelihood_is_that_of_the_exact_gaussian(plan: Setup, missing: tupl
     e, s = np.asarray(track.innovation), np.asarray(track.variance)
     ours = -0.5 * np.sum(ok * (np.log(2 * np.pi * s) + e**2 / s))
     np.testing.assert_allclose(ours, exact_log_likelihood(plan, 1, r, q, load, ok), rtol=2e-6)
+
+
+@pytest.mark.parametrize(("late", "lag"), [(0.0, 1.0), (1.0, 0.0), (1.0, 1.0)])
+def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: float) -> None:
+    """Against exp(-d s)/(1 + tau s) on the exponential with which v settles, which has a closed form."""
+    effects = [
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        for kind in ("sensor_delay", "sensor_lag")
+    ]
+    plan = setup(model(), recording(), (), effects, 4)
+    names = [q.name for q in plan.augmented.params]
+    u, v_0, end = 0.8, -1.5, 0.8 * B / A
+    inputs = jnp.full((plan.lead + ROWS, 1), u)
+    deaf, still_there = Noise(jnp.full(2, 1e6), jnp.zeros(2)), (jnp.array([0.0, v_0]), jnp.full(2, 1e-9))
+    errors = []
+    for t in (0.02, 0.01):
+        p = p_of_plan(plan, A, B)
+        p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late * t, lag * t
+        rows = jnp.zeros((ROWS, 2))
+        track = plan.rule.track(still(jnp.asarray(p)), deaf, rows, rows + 1, inputs, *still_there)
+        read = -np.asarray(track.innovation)[2:, 1]
+        motion = np.exp(-A * (np.arange(2, ROWS) * DT - late * t)) / (1 - A * lag * t)
+        errors.append(np.abs(read - (end + (v_0 - end) * motion)).max())
+    assert errors[0] < 5e-5
+    assert 6 < errors[0] / errors[1] < 10  # third order in the time
 
 
 def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:

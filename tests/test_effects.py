@@ -36,19 +36,42 @@ def tanks() -> Model:
     ).model()
 
 
+def car(frame: str) -> Model:
+    """A car that turns where its wheels point: in the world frame, in its own frame, or with one speed."""
+    if frame == "world":
+        return build(yaml.safe_load((conf_dir() / "sim" / "rc_car.yaml").read_text()), "sim").model()
+    spans = {"x": "m", "y": "m", "theta": "rad", "v": "m/s"} | ({"w": "m/s", "r": "rad/s"} if frame == "body" else {})
+    bodies = {
+        "body": {"x": "v*cos(theta) - w*sin(theta)", "y": "v*sin(theta) + w*cos(theta)", "theta": "r",
+                 "v": "4*throttle - b*v", "w": "(0.1*v*steer - w)/b", "r": "(v*steer - r)/b"},
+        "single": {"x": "v*cos(theta)", "y": "v*sin(theta)", "theta": "v*tan(steer)/0.3", "v": "4*throttle - b*v"},
+    }  # fmt: skip
+    return Declared(
+        f"car_{frame}",
+        dt=0.05,
+        states={n: {"unit": u, "range": [-3, 3], "periodic": n == "theta"} for n, u in spans.items()},
+        inputs={n: {"unit": "1", "range": [-1, 1]} for n in ("steer", "throttle")},
+        parameters={"b": {"unit": "1/s", "range": [0.5, 1.5]}},
+        dynamics=bodies[frame],
+    ).model()
+
+
 PENDULUM, TANKS = pendulum(), tanks()
+WORLD, BODY, SINGLE = CARS = tuple(car(frame) for frame in ("world", "body", "single"))
+VEHICLE = ("rolling_resistance", "traction_limit", "tyre_slip")
 SCALES = {
     "pendulum": Scales({"phi": 3.0, "omega": 4.0, "u": 2.0}, {"phi": 2.0, "omega": 6.0}, 0.05),
     "tanks": Scales({"h": 0.8, "k": 0.7, "u": 1.0}, {"h": 0.2, "k": 0.1}, 1.0),
-}
+} | {m.name: Scales({q.name: 2.0 for q in (*m.states, *m.inputs)}, {q.name: 3.0 for q in m.states}, m.dt) for m in CARS}
+MEASURED = {m.name: tuple(q.name for q in m.states) for m in (PENDULUM, TANKS, *CARS)}
 
 
 def terms_of(name: str) -> list[tuple[Model, Term]]:
     effect = catalogue(name)
     return [
         (model, term)
-        for model, measured in ((PENDULUM, ("phi", "omega")), (TANKS, ("h", "k")))
-        for term in effect.attach(model, SCALES[model.name], measured)
+        for model in (PENDULUM, TANKS, *(CARS if name in VEHICLE else ()))
+        for term in effect.attach(model, SCALES[model.name], MEASURED[model.name])
     ]
 
 
@@ -71,7 +94,7 @@ def points(model: Model, seed: int = 0) -> list[tuple[list[float], list[float]]]
 
 
 def test_the_catalogue_is_that_of_the_plan() -> None:
-    assert len(NAMES) >= 29
+    assert len(NAMES) >= 34
     listed = yaml.safe_load((conf_dir() / "effect" / "all.yaml").read_text())["defaults"]
     assert sorted(listed) == NAMES
 
@@ -90,9 +113,7 @@ class TestEffect:
     def test_is_the_old_model_at_its_neutral_point(self, name: str) -> None:
         for model, term in terms_of(name):
             for x, u in points(model):
-                old = np.asarray(
-                    model.function()(x, u, augment(model, [], ["h"] if model is TANKS else ["phi"]).neutral)[0]
-                )
+                old = np.asarray(model.function()(x, u, augment(model, [], MEASURED[model.name]).neutral)[0])
                 rates, y = values(model, term, x, u, [k.neutral for k in term.knobs])
                 np.testing.assert_allclose(rates, old.ravel(), rtol=1e-12, atol=1e-12)
                 np.testing.assert_allclose(y, x, rtol=1e-12)
@@ -116,7 +137,7 @@ class TestEffect:
                 assert all(knob.low < s < knob.high for s in knob.starts)
                 # a limit is neutral where nothing reaches it, beyond the range
                 assert knob.low <= knob.neutral <= knob.high or (
-                    term.effect == "input_saturation" and knob.neutral > knob.high
+                    term.effect in ("input_saturation", "traction_limit") and knob.neutral > knob.high
                 )
                 assert re.fullmatch(r"[\w^/() ]+", knob.unit), knob.unit
 
@@ -125,11 +146,11 @@ class TestEffect:
         if not effect.dissipative:
             return
         for model, term in terms_of(name):
-            row = [q.name for q in model.states].index(term.acts_on)
+            rows = [i for i, q in enumerate(model.states) if q.name in term.rates]
             for x, u in points(model):
                 knobs = [float(random.uniform(k.low, k.high)) for k in term.knobs]
                 off = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
-                assert (values(model, term, x, u, knobs)[0] - off)[row] * x[row] <= 0
+                assert (values(model, term, x, u, knobs)[0] - off)[rows] @ np.array(x)[rows] <= 0
 
 
 @pytest.mark.parametrize("name", ["viscous_friction", "coulomb_friction", "stribeck_friction", "quadratic_drag"])
@@ -146,6 +167,105 @@ def test_friction_is_odd_in_speed(name: str) -> None:
             np.testing.assert_allclose(pushes[0], -pushes[1], rtol=1e-9)
 
 
+def term_on(name: str, model: Model) -> Term:
+    (term,) = catalogue(name).attach(model, SCALES[model.name], MEASURED[model.name])
+    return term
+
+
+def push(model: Model, term: Term, x: list[float], u: list[float], knobs: list[float]) -> np.ndarray:
+    off = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
+    return values(model, term, x, u, knobs)[0] - off
+
+
+def along(model: Model, theta: float, long: float, lat: float) -> tuple[list[float], np.ndarray]:
+    """Velocities of a car in the order of its states, and the matrix that turns their rates into its axes."""
+    c, s = np.cos(theta), np.sin(theta)
+    turn = np.array([[c, s], [-s, c]]) if model is WORLD else np.eye(2)
+    return (turn.T @ [long, lat]).tolist(), turn
+
+
+@pytest.mark.parametrize("name", VEHICLE)
+def test_only_vehicles_have_tyres(name: str) -> None:
+    quadrotor = Declared(  # two velocities and an angle, but no speed turns it
+        "quadrotor", dt=0.1,
+        states={n: {"unit": u, "range": [-1, 1]} for n, u in
+                {"x": "m", "z": "m", "phi": "rad", "vx": "m/s", "vz": "m/s", "w": "rad/s"}.items()},
+        inputs={"f": {"range": [0, 1]}, "m": {"range": [-1, 1]}},
+        dynamics={"x": "vx", "z": "vz", "phi": "w", "vx": "-f*sin(phi)", "vz": "f*cos(phi) - 9.81", "w": "m"},
+    ).model()  # fmt: skip
+    cart = build(yaml.safe_load((conf_dir() / "sim" / "spring_cart.yaml").read_text()), "sim").model()
+    for model in (quadrotor, cart, PENDULUM, TANKS):
+        size = {q.name: 1.0 for q in (*model.states, *model.inputs)}
+        assert not catalogue(name).attach(model, Scales(size, size, 0.1), ())
+    assert [len(catalogue(name).attach(m, SCALES[m.name], ())) for m in CARS] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.7, -2.5])
+@pytest.mark.parametrize("model", [WORLD, BODY], ids=["world", "body"])
+class TestCarWithTwoVelocities:
+    def test_rolling_resistance_is_odd_and_along_the_heading(self, model: Model, theta: float) -> None:
+        term = term_on("rolling_resistance", model)
+        found = []
+        for sign in (1, -1):
+            v, turn = along(model, theta, sign * 1.5, 0.4)
+            found.append(turn @ push(model, term, [0.1, 0.2, theta, *v, 0.3], [0.5, 0.5], [0.8, 0.05])[3:5])
+        np.testing.assert_allclose(found, [[-0.8, 0], [0.8, 0]], atol=1e-9)
+
+    def test_traction_limits_the_rate_of_the_forward_speed_alone(self, model: Model, theta: float) -> None:
+        term, limit = term_on("traction_limit", model), 1.2
+        v, turn = along(model, theta, 1.5, 0.4)
+        x, u, yaw = [0.1, 0.2, theta, *v, 0.3], [0.5, 0.9], 0.3
+        own = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
+        # d(long)/dt by a difference: a short time along the model's own rates
+        after = np.array(x) + 1e-7 * own
+        long = after[3] if model is BODY else after[3] * np.cos(after[2]) + after[4] * np.sin(after[2])
+        wanted = (long - 1.5) / 1e-7
+        assert abs(wanted) > limit
+        change = push(model, term, x, u, [limit])
+        np.testing.assert_allclose(
+            turn @ change[3:5], [limit * np.tanh(wanted / limit) - wanted, 0], rtol=1e-5, atol=1e-9
+        )
+        assert yaw + change[5] == yaw
+
+    def test_slip_does_not_depend_on_where_the_car_points(self, model: Model, theta: float) -> None:
+        term = term_on("tyre_slip", model)
+        v, turn = along(model, theta, -1.5, 0.4)
+        change = push(model, term, [0.1, 0.2, theta, *v, 0.3], [0.5, 0.9], [0.2, 0.05])
+        np.testing.assert_allclose(turn @ change[3:5], [0, -0.05 * -1.5 * 1.5 * 0.3], atol=1e-12)
+        np.testing.assert_allclose(change[5], -0.2 * 1.5**2 * 0.3, rtol=1e-12)
+
+
+def test_slip_settles_to_the_linear_single_track_model() -> None:
+    """Against the steady state of the full model, by its own equations: forces of both axles, m, I, C_f, C_r."""
+    l_f, l_r, mass, c_f, c_r, delta, v = 0.13, 0.17, 1.65, 30.0, 35.0, 0.05, 2.0
+    matrix = np.array([  # m (dw/dt + v r) = F_f + F_r,   I dr/dt = l_f F_f - l_r F_r,   in w and r
+        [-(c_f + c_r) / v, -(l_f * c_f - l_r * c_r) / v - mass * v],
+        [-(l_f * c_f - l_r * c_r) / v, -(l_f**2 * c_f + l_r**2 * c_r) / v],
+    ])  # fmt: skip
+    w, r = np.linalg.solve(matrix, -np.array([c_f * delta, l_f * c_f * delta]))
+    length, tau = l_f + l_r, 0.1
+    understeer = mass * (l_r * c_r - l_f * c_f) / (length**2 * c_f * c_r)
+    drift = mass * l_f / (length * c_r)
+    k_yaw, k_lat = understeer / tau, (drift + l_r * understeer) / tau
+    term = term_on("tyre_slip", BODY)
+    x = [0, 0, 0, v, w, r]
+    change = push(BODY, term, x, [0, 0], [k_yaw, k_lat])
+    rolling = v * delta / length
+    np.testing.assert_allclose((rolling - r) / tau + change[5], 0, atol=1e-9)
+    np.testing.assert_allclose((l_r * rolling - w) / tau + change[4], 0, atol=1e-9)
+    # and on a heading without inertia
+    single = term_on("tyre_slip", SINGLE)
+    steer = np.arctan(0.3 * rolling / v)
+    np.testing.assert_allclose(values(SINGLE, single, [0, 0, 0, v], [steer, 0], [understeer])[0][2], r, rtol=1e-9)
+
+
+def test_a_term_per_part_is_for_vehicles() -> None:
+    with pytest.raises(ModelError, match="a term per part goes with `acts_on: planar` alone"):
+        Expression("mine", acts_on="planar", term={"up": "-k"})
+    with pytest.raises(ModelError, match="a term per part goes with `acts_on: planar` alone"):
+        Expression("mine", acts_on="velocity", term={"long": "-k"})
+
+
 def test_units_follow_from_the_model() -> None:
     units = {t.effect: t.knobs[0].unit for m, t in (pair for n in NAMES for pair in terms_of(n)) if m is PENDULUM}
     assert units["viscous_friction"] == "1/s"
@@ -154,6 +274,9 @@ def test_units_follow_from_the_model() -> None:
     assert units["linear_stiffness"] == "1/s^2"
     assert units["input_delay"] == "s"
     assert units["input_dead_zone"] == "V"
+    assert units["input_backlash"] == "V"
+    assert [k.unit for k in term_on("tyre_slip", WORLD).knobs] == ["s/m^2", "s/(m rad)"]
+    assert [k.unit for k in term_on("tyre_slip", SINGLE).knobs] == ["s^2/m^2"]
 
 
 def test_roles_are_read_off_the_model() -> None:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.signals import arriving
+from simpel_cli.signals import arriving, play
 
 DT, SUBSTEPS, LEAD = 0.1, 4, 8
 U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
@@ -67,3 +67,40 @@ def test_derivatives_are_those_of_differences(at: tuple[float, float]) -> None:
             continue
         slope = (total(jnp.array(at + move)) - total(jnp.array(at - move))) / (2 * step)
         np.testing.assert_allclose(gradient[i], slope, rtol=1e-5)
+
+
+def played(half: float, u: np.ndarray = U) -> np.ndarray:
+    """The play operator as it is written down."""
+    v, out = u[0, 0], []
+    for now in u[:, 0]:
+        v = min(now + half, max(now - half, v))
+        out.append(v)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("half", [0.0, 0.3, 1.1])
+def test_a_play_is_the_play_operator(half: float) -> None:
+    np.testing.assert_allclose(play(jnp.asarray(U), jnp.array([half]))[:, 0], played(half), rtol=1e-12)
+
+
+def test_a_play_is_crossed_once_per_reversal() -> None:
+    u = np.array([0.0, 1.0, 2.0, 1.8, 1.2, 0.0, 0.3, 3.0])[:, None]
+    np.testing.assert_allclose(play(jnp.asarray(u), jnp.array([0.5]))[:, 0], [0, 0.5, 1.5, 1.5, 1.5, 0.5, 0.5, 2.5])
+
+
+def test_a_play_comes_before_delay_and_lag() -> None:
+    both = arriving(
+        jnp.asarray(U), jnp.array([0.137]), jnp.array([0.2]), dt=DT, substeps=SUBSTEPS, lead=LEAD,
+        half_play=jnp.array([0.4]),
+    )  # fmt: skip
+    np.testing.assert_allclose(np.asarray(both)[..., 0], arrived(0.137, 0.2, played(0.4)[:, None]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("half", [0.0, 0.3])
+def test_the_slope_in_a_play_is_that_of_a_growing_one(half: float) -> None:
+    steps = jnp.arange(1.0, len(U) + 1)
+    staying = np.repeat(U, 2, axis=0)[: len(U)]  # inputs that are held for two rows
+    total = lambda c: jnp.sum(play(jnp.asarray(staying), c[None])[:, 0] * steps)  # noqa: E731
+    slope = (total(jnp.asarray(half + 1e-6)) - total(jnp.asarray(half))) / 1e-6
+    assert abs(slope) > 1
+    np.testing.assert_allclose(jax.grad(total)(jnp.asarray(half)), slope, rtol=1e-5)

@@ -114,10 +114,7 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
         lacks = found.get("corrected_sim_lacks")
         if lacks:
-            text = (
-                "The corrected YAML holds the system, not its sensors; it lacks: "
-                f"{', '.join(words(name) for name in lacks)}. The errors above are with it."
-            )
+            text = f"The corrected YAML lacks {'; '.join(words(name) for name in lacks)}. The errors above are with it."
     title = "The equation before and after" if found["effects"] else "The equation"
     return {"title": title, "equations": blocks, "after": text}
 

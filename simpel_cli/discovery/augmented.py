@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from simulators.effects import Structure, Term, structure
-from simulators.effects.term import DELAY, INPUT, LAG, OPERATORS, RATE, SENSOR, SENSOR_DELAY
+from simulators.effects.term import DELAY, INPUT, LAG, ON_INPUT, OPERATORS, SENSOR
 from simulators.expression import parse
 from simulators.model import Model, Quantity
 
@@ -26,7 +26,7 @@ class Augmented(NamedTuple):
         function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, all knobs, all constants.
         params: the rows of p; those of constants have one value for range.
         neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
-        operators: kind -> (index of the signal, row of p) for delays and lags, those of the model and of the terms.
+        operators: kind -> (index of the signal, row of p) for delays, lags and plays, of the model and of the terms.
         own_delay: (nu) known delays of the model, s.
         own_lag: (nu) known lags, s.
         roles: of the states.
@@ -76,10 +76,12 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
     names |= {q.name: given[j] for j, q in enumerate(model.inputs)}
     base = model.rhs(x, effective, own)
     rates = [base[i] for i in range(len(model.states))]
+    own_rates = {f"rate_{q.name}": base[i] for i, q in enumerate(model.states)}
     for i, q in enumerate(model.states):
         for term in terms:
-            if term.kind == RATE and term.acts_on == q.name:
-                rates[i] += parse(term.expression, names | {"rate": base[i]}, model.symbol)
+            if q.name in term.rates:
+                known = names | (own_rates if term.several else {"rate": base[i]})
+                rates[i] += parse(term.rates[q.name], known, model.symbol)
     outputs = model.output(x, effective, own)
     values = {q.name: x[i] for i, q in enumerate(model.states)}
     values |= {q.name: outputs[i] for i, q in enumerate(model.outputs)}
@@ -98,11 +100,12 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
         ["dx", "y"],
     )
     columns = [q.name for q in params]
-    signals = {DELAY: [q.name for q in model.inputs], LAG: [q.name for q in model.inputs], SENSOR_DELAY: [*measured]}
-    operators = {
-        kind: tuple((signals[kind].index(t.acts_on), columns.index(t.knobs[0].name)) for t in terms if t.kind == kind)
-        for kind in OPERATORS
-    }
+    operators: dict[str, tuple[tuple[int, int], ...]] = {}
+    for kind in OPERATORS:
+        signals = [q.name for q in model.inputs] if kind in ON_INPUT else [*measured]
+        operators[kind] = tuple(
+            (signals.index(t.acts_on), columns.index(t.knobs[0].name)) for t in terms if t.kind == kind
+        )
     constant: dict[str, tuple[float, ...]] = {}
     for kind, times in ((DELAY, model.delay), (LAG, model.lag)):
         each = [times.get(q.name, 0.0) for q in model.inputs]

@@ -6,11 +6,16 @@ from typing import Any
 from simpel_cli.discovery.selection import Search, Trial
 from simpel_cli.discovery.verdict import Z95, interval_of
 from simulators.effects import Term
-from simulators.effects.term import DELAY, INPUT, LAG, RATE, SENSOR, SENSOR_DELAY
+from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR
+
+_SENSOR = "a simulator says what happens, not what a sensor reads: correct the measurements instead"
+CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
+    BACKLASH: "a transition cannot tell on which side of its play an input is: that may have been settled long ago"
+}
 
 
 def corrected(sim: dict[str, Any], search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
-    """Return name, YAML and what could not be written.
+    """Return name, YAML and what could not be written, each with the reason.
 
     Priors of the effects' parameters are normal, with the 95 % interval of the fit for range; the simulator's own
     keep the ranges that the user declared.
@@ -24,40 +29,48 @@ def corrected(sim: dict[str, Any], search: Search, trial: Trial) -> tuple[str, d
     name = f"{sim['name']}_with_" + "_and_".join(t.effect for t in terms)
     node = {key: dict(value) if isinstance(value, dict) else value for key, value in sim.items()}
     node["name"] = name
-    left_out = []
     taken = {key for section in ("states", "inputs", "parameters", "outputs") for key in sim.get(section) or {}}
-    for index, term in zip(trial.terms, terms, strict=True):
-        if term.kind in (SENSOR, SENSOR_DELAY):
-            left_out.append(term.label)
+    written: list[Term] = []
+    names: dict[str, str] = {}
+    for index, term in sorted(zip(trial.terms, terms, strict=True)):
+        if term.kind in CANNOT:
             continue
-        names: dict[str, str] = {}
+        written.append(term)
         for knob, row in zip(term.knobs, search.rows[index], strict=True):
-            short = knob.label if knob.label not in taken else f"{knob.label}_{term.acts_on}"
+            short = knob.label if knob.label not in taken else f"{knob.label}_{term.acts_on.replace(', ', '_')}"
             short = short if short not in taken else knob.name
             taken.add(short)
             names[knob.name] = short
             span = interval_of(search, trial, row, Z95)
             low, high = sorted((span["low"], span["high"]))
-            node["parameters"][short] = (
+            node.setdefault("parameters", {})[short] = (
                 {"unit": knob.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
             )
-        _write(node, term, names)
-    return name, node, left_out
+    _write(node, written, names)
+    return name, node, [f"{t.label} ({CANNOT[t.kind]})" for t in terms if t.kind in CANNOT]
 
 
-def _write(node: dict[str, Any], term: Term, names: dict[str, str]) -> None:
-    text = _renamed(term.expression, names)
-    if term.kind == RATE:
-        own = node["dynamics"][term.acts_on]
-        text = _renamed(text, {"rate": f"({own})"})
-        node["dynamics"][term.acts_on] = f"{own} + ({text})"
-    elif term.kind in (DELAY, LAG):
-        node["inputs"] = node["inputs"] | {
-            term.acts_on: node["inputs"][term.acts_on] | {term.kind: names[term.knobs[0].name]}
-        }
-    elif term.kind == INPUT:
-        for row, own in node["dynamics"].items():
-            node["dynamics"][row] = _renamed(str(own), {term.acts_on: f"({text})"})
+def _write(node: dict[str, Any], terms: list[Term], names: dict[str, str]) -> None:
+    """Write terms, in the order in which they were attached, as the augmented model has them."""
+    given: dict[str, str] = {}
+    for term in terms:
+        if term.kind in (DELAY, LAG):
+            own = node["inputs"][term.acts_on]
+            node["inputs"][term.acts_on] = own | {term.kind: names[term.knobs[0].name]}
+        elif term.kind == INPUT:
+            own = {term.acts_on: given.get(term.acts_on, term.acts_on)}
+            given[term.acts_on] = f"({_renamed(term.expression, names | own)})"
+    # what the simulator says with the inputs as they act: every term adds to that, and takes its rates from that
+    base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
+    rates = {f"rate_{state}": f"({text})" for state, text in base.items()}
+    node["dynamics"] = dict(base)
+    for output, own in (node.get("outputs") or {}).items():
+        new = _renamed(str(own["expression"] if isinstance(own, dict) else own), given)
+        node["outputs"][output] = own | {"expression": new} if isinstance(own, dict) else new
+    for term in terms:
+        for state, text in term.rates.items():
+            swap = names | given | (rates if term.several else {"rate": rates[f"rate_{state}"]})
+            node["dynamics"][state] += f" + ({_renamed(text, swap)})"
 
 
 def _renamed(text: str, swap: dict[str, str]) -> str:

@@ -139,7 +139,7 @@ def _curves(search: Search, selection: Selection, span: dict[str, np.ndarray]) -
         p = neutral.copy()
         for i in search.rows[t]:
             p[i] = coordinates.value(i, float(chosen.optimum.z[i]))
-        used = symbols_used(term.expression)
+        used = set().union(*(symbols_used(e) for e in term.rates.values() or (term.expression,)))
         for argument in [name for name in span if name in used]:
             values = np.linspace(np.nanmin(span[argument]), np.nanmax(span[argument]), GRID)
             at = middle | {argument: values}

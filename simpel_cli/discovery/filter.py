@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from simpel_cli.discovery.augmented import Augmented
 from simpel_cli.discovery.slopes import with_slope
 from simpel_cli.signals import arriving
-from simulators.effects.term import DELAY, LAG, SENSOR_DELAY
+from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
 
 class Noise(NamedTuple):
@@ -118,7 +118,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     h = dt / substeps
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
-    delays, lags, sensor_delays = (augmented.operators[kind] for kind in (DELAY, LAG, SENSOR_DELAY))
+    delays, lags, plays = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH))
+    sensor_delays, sensor_lags = (augmented.operators[kind] for kind in (SENSOR_DELAY, SENSOR_LAG))
 
     def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
         values = [jnp.full(p.shape[1:], own[i] if own else 0.0, p.dtype) for i in range(size)]
@@ -127,8 +128,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
 
     def inputs(p: Array, u: Array) -> Array:
-        run = _over_points(lambda *a: arriving(*a, dt=dt, substeps=substeps, lead=lead), p.ndim - 1)
-        return run(u, per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag))
+        times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
+        widths = (per_signal(p, plays, nu),) if plays else ()
+
+        def one(u: Array, delay: Array, lag: Array, *play: Array) -> Array:
+            return arriving(u, delay, lag, dt=dt, substeps=substeps, lead=lead, half_play=play[0] if play else None)
+
+        return _over_points(one, p.ndim - 1)(u, *times, *widths)
 
     def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
@@ -153,12 +159,21 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return jax.lax.scan(step, (x, unit, *nothing), u)[0]
 
     def measure(given: Moving, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
-        """Return what the sensors read and its derivative in the state; a late one looks back along the rate."""
+        """Return what the sensors read and its derivative in the state; a late one looks back along the rate.
+
+        A delay d and a lag tau act together as exp(-d s)/(1 + tau s), to second order
+
+            y - (d + tau) y' + (d^2/2 + d tau + tau^2) y''
+
+        which holds while d and tau are short against the motion (the next term is about tau^3 times the third
+        derivative) and against the time since the input last changed: y' and y'' are those of the substep that just ended.
+        """
         y, slope = sensors(x, u, given)
-        if not sensor_delays:
+        if not (sensor_delays or sensor_lags):
             return y, slope
-        late = per_signal(given.p, sensor_delays, ny)[:, None]
-        back = -late * rate[None] + 0.5 * late**2 * product(rate_x, rate[:, None])[None, :, 0]
+        d, tau = (per_signal(given.p, rows, ny)[:, None] for rows in (sensor_delays, sensor_lags))
+        late, twice = d + tau, 0.5 * d**2 + d * tau + tau**2
+        back = -late * rate[None] + twice * product(rate_x, rate[:, None])[None, :, 0]
         return y + jnp.sum(slope * back, axis=1), slope - late * product(slope, rate_x)
 
     def track(given: Moving, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> Track:

@@ -14,12 +14,13 @@ from simpel_cli.discovery.steps import substeps_needed
 from simpel_cli.discovery.windows import Windows, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
-from simulators.effects.term import DELAY, LAG
+from simulators.effects.term import BACKLASH, DELAY, LAG
 from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 FOLDS = 5
+PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
 
 
 class Setup(NamedTuple):
@@ -73,6 +74,8 @@ def setup(
     augmented = augment(model, terms, measured)
     longest = max((k.high for t in terms if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
+    if any(t.kind == BACKLASH for t in terms):
+        lead = max(lead, PLAY_ROWS)
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
     middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     windows = windows_of(

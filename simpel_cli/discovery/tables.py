@@ -214,7 +214,7 @@ def candidate_columns(search: Search, selection: Selection) -> Columns:
             rows.append(
                 {
                     "step": step, "effect": term.effect, "acts_on": term.acts_on, "depends_on": ",".join(term.depends_on),
-                    "expression": term.expression or term.kind,
+                    "expression": term.formula,
                     "log_evidence_gain": trial.optimum.log_evidence - stage.before.optimum.log_evidence,
                     "accepted": set(trial.terms) == set(following),
                     "kept": trial.terms[-1] in selection.chosen.terms,

@@ -10,10 +10,12 @@ import casadi
 
 from simulators.effects.structure import structure
 from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR, Knob, Term
+from simulators.effects.vehicle import PARTS, Vehicle, vehicle
 from simulators.expression import RESERVED, parse
 from simulators.model import Model, ModelError
 
-ROLES = ("velocity", "angle_velocity", "first_order", "input", "measured", "measured_angle")
+PLANAR = "planar"  # a vehicle in the plane: a term per part of it
+ROLES = ("velocity", "angle_velocity", "first_order", "input", "measured", "measured_angle", PLANAR)
 KIND_OF_ROLE = {"velocity": RATE, "angle_velocity": RATE, "first_order": RATE, "input": INPUT}
 
 
@@ -38,15 +40,20 @@ class Expression:
     Args:
         name: of the effect.
         meaning: one physical sentence.
-        acts_on: where: roles (velocity, angle_velocity, first_order, input, measured, measured_angle) or names of
+        acts_on: where: roles (velocity, angle_velocity, first_order, input, measured, measured_angle, planar) or names of
             states, inputs and measured quantities.
         term: what is added to the rate of a state, or what stands in place of an input or a measured quantity. Roles can
             be used for names: `v` the velocity acted on, `s` its position, `x` the first-order state, `other` another
-            state of the same unit, `u` the input, `y` the measured quantity, `rate` the model's own rate.
-        operator: in place of `term`: delay, lag or sensor_delay, on the signal that it acts on; its one parameter is s.
+            state of the same unit, `u` the input, `y` the measured quantity, `rate` the model's own rate. For `planar` a
+            mapping {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the accelerations along, across and
+            about the vehicle, and to the rate of a heading without inertia, each where the model has it; names are `long`,
+            `lat`, `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in these axes.
+        operator: in place of `term`: delay, lag, backlash, sensor_delay or sensor_lag, on the signal that it acts on, with
+            one parameter.
         kind: rate, input or sensor, where `acts_on` names quantities; found from the model if left out.
         parameters: name -> {range: [low, high], unit, neutral: 0, starts: [...]}. Numbers, or expressions of the scales A
-            (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`.
+            (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
+            A, V of the vehicle's speed, W, Q of its yaw rate (largest magnitude, typical rate).
         same_as: effects that no data can tell from this one.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
@@ -55,7 +62,7 @@ class Expression:
     name: str
     meaning: str = ""
     acts_on: Any = ()
-    term: str = ""
+    term: str | Mapping[str, str] = ""
     operator: str = ""
     kind: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -72,7 +79,13 @@ class Expression:
         if self.operator and (self.operator not in OPERATORS or len(self.parameters) != 1):
             raise ModelError(
                 f"{where}.operator: {self.operator!r} with {len(self.parameters)} parameters; allowed are "
-                f"{', '.join(OPERATORS)} with one parameter, a time in s"
+                f"{', '.join(OPERATORS)} with one parameter"
+            )
+        parts = list(self.term) if isinstance(self.term, Mapping) else []
+        if bool(parts) != (PLANAR in self.places) or not set(parts) <= set(PARTS) or (parts and len(self.places) > 1):
+            raise ModelError(
+                f"{where}.term: a term per part goes with `acts_on: {PLANAR}` alone; write {{long: ...}}; parts: "
+                f"{', '.join(PARTS)}"
             )
         for name, node in self.parameters.items():
             if not (
@@ -98,6 +111,9 @@ class Expression:
         Raises:
             ModelError: a place or a name in the term that the model does not have.
         """
+        if isinstance(self.term, Mapping):
+            car = vehicle(model)
+            return self._on_vehicle(self.term, car, model, scales) if car else []
         roles = structure(model)
         units = {q.name: q.unit for q in (*model.states, *model.inputs, *model.outputs)}
         periodic = {q.name for q in model.states if q.periodic}
@@ -118,15 +134,22 @@ class Expression:
                     f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
                 )
             for name in members.get(place, (place,)):
-                terms += self._at(name, model, scales, roles.velocity.get(name), units, place)
+                terms += self._at(name, self.term, model, scales, roles.velocity.get(name), units, place)
         return terms
 
     def _at(
-        self, name: str, model: Model, scales: Scales, position: str | None, units: dict[str, str], place: str
+        self,
+        name: str,
+        term: str,
+        model: Model,
+        scales: Scales,
+        position: str | None,
+        units: dict[str, str],
+        place: str,
     ) -> list[Term]:
         states = [q.name for q in model.states]
         kind = self.operator or self.kind or KIND_OF_ROLE.get(place) or _kind(name, model, place)
-        names = _names(self.term) if self.term else set()
+        names = _names(term) if term else set()
         if ("s" in names and position is None and "s" not in units) or (
             "S" in str(self.parameters) and position is None
         ):
@@ -147,32 +170,63 @@ class Expression:
             values["S"] = 3.141592653589793
         found = []
         for other in others:
-            prefix = f"{self.name}_{name}" + (f"_{other}" if other else "")
-            knobs = []
-            for label, node in self.parameters.items():
-                low, high = (_value(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
-                null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
-                given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
-                starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
-                knobs.append(
-                    Knob(f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts)
-                )
+            knobs = self._knobs(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
             swap = own | {"other": other} | {k.label: k.name for k in knobs}
-            text = _renamed(self.term, {k: v for k, v in swap.items() if v is not None}) if self.term else ""
-            found.append(
-                Term(
-                    self.name,
-                    name,
-                    kind,
-                    text,
-                    tuple(knobs),
-                    self.meaning,
-                    tuple(self.same_as),
-                    tuple(self.generalises),
-                    self.dissipative,
-                )
-            )
+            text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
+            found.append(self._term(name, kind, text, knobs))
         return found
+
+    def _on_vehicle(self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales) -> list[Term]:
+        """Return one term on the rates of all states that the parts act on."""
+        own = {part: text for part, text in parts.items() if part in car.parts}
+        if not own:
+            return []
+        speeds, turn = list(car.parts["long"]), (car.parts.get("yaw") or car.parts["heading"])
+        values = {
+            "A": max(scales.rate[s] for s in speeds),
+            "V": max(scales.size[s] for s in speeds),
+            "W": max((scales.size if "yaw" in car.parts else scales.rate)[s] for s in turn),
+            "dt": scales.dt,
+        }
+        unit_of = {"A": "m/s^2", "V": "m/s", "W": "rad/s"}
+        if "yaw" in car.parts:
+            values["Q"], unit_of["Q"] = max(scales.rate[s] for s in turn), "rad/s^2"
+        states = [q.name for q in model.states if any(q.name in car.parts[part] for part in own)]
+        used = set().union(*(_names(text) for text in own.values()))
+        knobs = self._knobs("_".join([self.name, *states]), values, unit_of, used)
+        swap = car.names | {k.label: k.name for k in knobs}
+        sums: dict[str, list[str]] = {state: [] for state in states}
+        for part, text in own.items():
+            for state, factor in car.parts[part].items():
+                push = f"({_renamed(text, swap)})"
+                sums[state].append(push if factor == "1" else f"{factor}*{push}")
+        several = tuple((state, " + ".join(terms)) for state, terms in sums.items())
+        return [self._term(", ".join(states), RATE, "", knobs, several)]
+
+    def _knobs(
+        self, prefix: str, values: Mapping[str, float], unit_of: Mapping[str, str], used: set[str] | None = None
+    ) -> tuple[Knob, ...]:
+        """Return the parameters, or those that are used, in the scales of a place."""
+        knobs = []
+        for label, node in self.parameters.items():
+            if used is not None and label not in used:
+                continue
+            low, high = (_value(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
+            null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
+            given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
+            starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
+            knobs.append(
+                Knob(f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts)
+            )
+        return tuple(knobs)
+
+    def _term(
+        self, name: str, kind: str, text: str, knobs: tuple[Knob, ...], several: tuple[tuple[str, str], ...] = ()
+    ) -> Term:
+        return Term(
+            self.name, name, kind, text, knobs, self.meaning, tuple(self.same_as), tuple(self.generalises), self.dissipative,
+            several=several,
+        )  # fmt: skip
 
 
 def _kind(name: str, model: Model, place: str) -> str:

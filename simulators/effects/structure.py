@@ -33,11 +33,7 @@ def structure(model: Model) -> Structure:
     A rate is kinematic if it is another state itself, or depends on states alone, one of which has its unit. A state is
     a velocity if a kinematic rate depends on it and it has that rate's unit, or if its unit is one of m/s and rad/s.
     """
-    x, u, p = (
-        casadi.SX.sym(n, len(g), 1) for n, g in zip("xup", (model.states, model.inputs, model.params), strict=True)
-    )
-    rates = model.function()(x, u, p)[0]
-    on_x, on_u, on_p = (_depends(rates, symbol) for symbol in (x, u, p))
+    on_x, on_u, on_p = depends(model)
     units = [_plain(q.unit) for q in model.states]
     identity = _identities(model)
     kinematic: dict[int, int] = {}
@@ -59,6 +55,14 @@ def structure(model: Model) -> Structure:
         else:
             first.append(name)
     return Structure(tuple(names[i] for i in kinematic), velocity, tuple(first))
+
+
+def depends(model: Model) -> tuple[np.ndarray, ...]:
+    """Return which rates depend on which states, inputs and parameters: a table (states, ...) of each."""
+    groups = (model.states, model.inputs, model.params)
+    symbols = [casadi.SX.sym(n, len(g), 1) for n, g in zip("xup", groups, strict=True)]
+    rates = model.function()(*symbols)[0]
+    return tuple(_depends(rates, symbol) for symbol in symbols)
 
 
 def _depends(rates: casadi.SX, symbol: casadi.SX) -> np.ndarray:

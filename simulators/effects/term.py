@@ -3,8 +3,11 @@
 from typing import NamedTuple
 
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
-DELAY, LAG, SENSOR_DELAY = "delay", "lag", "sensor_delay"  # operators on a signal, which no expression can state
-OPERATORS = (DELAY, LAG, SENSOR_DELAY)
+# operators on a signal, which no expression can state
+DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
+ON_INPUT = (DELAY, LAG, BACKLASH)
+ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
+OPERATORS = (*ON_INPUT, *ON_SENSOR)
 
 
 class Knob(NamedTuple):
@@ -28,10 +31,11 @@ class Term(NamedTuple):
 
     Args:
         effect: its name.
-        acts_on: the state whose rate it changes, the input or the measured quantity that it alters.
+        acts_on: the state whose rate it changes, the input or the measured quantity that it alters; of a term on several
+            rates their states, separated by commas.
         kind: RATE, INPUT, SENSOR or one of OPERATORS.
-        expression: in the names of the model and of the knobs; empty for operators. RATE adds it to the rate; INPUT
-            and SENSOR put it in place of the quantity.
+        expression: in the names of the model and of the knobs; empty for operators and for terms on several rates. RATE
+            adds it to the rate; INPUT and SENSOR put it in place of the quantity.
         knobs: its parameters.
         meaning: one physical sentence.
         same_as: names of effects that no data can tell from this one.
@@ -40,6 +44,7 @@ class Term(NamedTuple):
         depends_on: arguments of a function without a physical name; empty for named effects.
         constants: numbers of the expression that were read off the measurements, by name; programs take them as
             arguments, so that other measurements share what was compiled.
+        several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate.
     """
 
     effect: str
@@ -53,8 +58,19 @@ class Term(NamedTuple):
     dissipative: bool = False
     depends_on: tuple[str, ...] = ()
     constants: tuple[tuple[str, float], ...] = ()
+    several: tuple[tuple[str, str], ...] = ()
 
     @property
     def label(self) -> str:
         """Name and place, e.g. `coulomb_friction on omega`."""
         return f"{self.effect} on {self.acts_on}"
+
+    @property
+    def rates(self) -> dict[str, str]:
+        """State -> what is added to its rate."""
+        return dict(self.several) or ({self.acts_on: self.expression} if self.kind == RATE else {})
+
+    @property
+    def formula(self) -> str:
+        """What it says, for a reader."""
+        return self.expression or "; ".join(f"{s}: {e}" for s, e in self.several) or self.kind
