@@ -372,3 +372,22 @@ def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytes
     assert tool.discover(folder, "run", few).wall != answer.wall  # what was run is not run again
     (folder / "sim" / "rig.yaml").write_text("_target_: simulators.model.Declared\nname: broken\n")
     assert "ConfigError" in tool.discover(folder, "other").error
+
+
+def test_plays_and_slow_sensors_agree_with_their_definitions() -> None:
+    dt, tau, half = 0.04, 0.05, 0.8
+    p = {"M": 1.4, "K": 60.0, "K_m": 4.0, "b": 2.0}
+    commands = np.array([1.0, -2.0, -1.5, 3.0, 2.5, -1.0])[None, :, None]
+    rate = lambda x, u, t: SYSTEMS["cart"].rate(x, u, p)  # noqa: E731
+    start = np.array([[0.1, -0.2]])
+    passed = np.array([1.0, -1.2, -1.2, 2.2, 2.2, -0.2])[None, :, None]
+    states, _, given = simulate(rate, start, commands, dt, play=[half])
+    np.testing.assert_allclose(states, simulate(rate, start, passed, dt)[0], rtol=1e-12)
+    np.testing.assert_array_equal(given, commands)
+    held = np.full_like(commands, 1.0)
+    states, read, _ = simulate(rate, start, held, dt, sensor_lag=np.array([0.0, tau]), fine=32)
+    np.testing.assert_allclose(read[..., 0], states[..., 0], rtol=1e-12)
+    # states s, v, what the sensor of v reads, and the command
+    A = np.array([[0, 1, 0, 0], [-60 / 1.4, -2 / 1.4, 0, 4 / 1.4], [0, 1 / tau, -1 / tau, 0], [0, 0, 0, 0.0]])
+    exact = [(expm(A * row * dt) @ [0.1, -0.2, -0.2, 1.0])[2] for row in range(6)]
+    np.testing.assert_allclose(read[0, :, 1], exact, atol=1e-4)

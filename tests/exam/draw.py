@@ -5,7 +5,19 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.exam.mujoco_plants import can
-from tests.exam.planted import ABSORBED, EFFECTS, INPUT, LATE_SENSOR, ONE, RATE, SENSOR, Effect, by_key
+from tests.exam.planted import (
+    ABSORBED,
+    EFFECTS,
+    INPUT,
+    LATE_SENSOR,
+    ONE,
+    OWN_RATE,
+    RATE,
+    SENSOR,
+    SLOW_SENSOR,
+    Effect,
+    by_key,
+)
 from tests.exam.plants import SYSTEMS
 
 FULL, POSITION, CLOSED, SHAKEN = "full", "position only", "closed loop", "process noise"
@@ -87,7 +99,7 @@ def possible(system: str, condition: str, effects: tuple[Effect, ...]) -> bool:
         return bool(told.velocity) and not any(e.both for e in effects)
     if condition == POSITION:
         return not any(e.both or (e.kind == SENSOR and e.acts_on not in told.position) for e in effects)
-    return condition != CLOSED or not any(e.kind == LATE_SENSOR for e in effects)
+    return condition != CLOSED or not any(e.kind in (LATE_SENSOR, SLOW_SENSOR) for e in effects)
 
 
 def _planted(random: np.random.Generator, system: str, kind: str) -> tuple[Effect, ...]:
@@ -97,7 +109,7 @@ def _planted(random: np.random.Generator, system: str, kind: str) -> tuple[Effec
         return (absorbed[random.integers(len(absorbed))],) if absorbed and random.random() < ABSORBED_SHARE else ()
     if kind == TWO:
         of_rate = [e for e in effects if e.group == ONE and e.kind == RATE and e.name != "added_inertia"]
-        of_input = [e for e in effects if e.group == ONE and e.kind not in (RATE, SENSOR) and not e.both]
+        of_input = [e for e in effects if e.group == ONE and e.kind not in (RATE, OWN_RATE, SENSOR) and not e.both]
         of_input += [e for e in effects if e.group == ONE and e.kind == INPUT and e.name == "input_dead_zone"]
         return of_rate[random.integers(len(of_rate))], of_input[random.integers(len(of_input))]
     pool = [e for e in effects if e.group == kind]

@@ -1,4 +1,5 @@
 """The exam's own formulas of missing physics: (v, s, t, knobs, x, u) -> what is added to the rate of v.
+Those of the whole rate: (rate, knobs, x) -> what stands in its place.
 
 v is the state acted on, s its position or the other state, t the time in the episode, x and u all states and inputs.
 Dry friction is a ramp, a stop is a stiff spring: nothing is smoothed for an optimiser's sake.
@@ -91,3 +92,17 @@ def swing(v, s, t, k, x, u):
 
 def inertia(v, s, t, k, x, u):
     raise NotImplementedError("scales the whole rate: see record.plant")
+
+
+def rolling(v, s, t, k, x, u):
+    return -k["c"] * ramp(v, k["_width"])
+
+
+def grip(rate, k, x):
+    """Tyres hold up to a limit and slide beyond it."""
+    return np.clip(rate, -k["_most"], k["_most"])
+
+
+def understeer(rate, k, x):
+    """Yaw rate of a car whose steering angle for a radius grows with the square of speed; x[3] is the speed."""
+    return rate / (1 + k["K"] * x[..., 3] ** 2)

@@ -34,6 +34,8 @@ def simulate(
     random: np.random.Generator | None = None,
     fine: int = FINE,
     tap: float = 0.0,
+    play: Sequence[float] = (),
+    sensor_lag: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrate a batch of episodes.
 
@@ -49,9 +51,12 @@ def simulate(
         random: for the process noise.
         fine: steps per row.
         tap: s after each row, less than dt: where the states are recorded a second time, for late sensors.
+        play: half width of the play in front of each input; none = 0.
+        sensor_lag: (nx,) time constants of sensors with a first-order lag, s; 0 = none. They begin at the first states.
 
     Returns:
-        states (B, rows, nx) at the rows, states `tap` later, and the commands as they were given (B, rows, nu).
+        states (B, rows, nx) at the rows, states `tap` later (what lagging sensors read there, where there are any), and
+        the commands as they were given (B, rows, nu).
     """
     commands = np.array(commands, float)
     count, rows, inputs = commands.shape
@@ -63,18 +68,24 @@ def simulate(
     if controller is not None:
         commands[:, 0] = controller(x, 0)
     z = commands[:, 0].copy()  # what the actuators deliver
+    passed, half = commands.copy(), np.zeros(inputs) if len(play) == 0 else np.asarray(play, float)
+    read, slowly = x.copy(), sensor_lag is not None and bool(np.any(sensor_lag))
     states, tapped = np.empty((count, rows, x.shape[1])), np.empty((count, rows, x.shape[1]))
     for row in range(rows):
         if controller is not None:
             commands[:, row] = controller(x, row)
+        passed[:, row] = np.clip(passed[:, max(row - 1, 0)], commands[:, row] - half, commands[:, row] + half)
         states[:, row] = x
         for a, b in itertools.pairwise(offsets):
             if abs(a - tap) <= NEAR * dt:
-                tapped[:, row] = x
+                tapped[:, row] = read if slowly else x
             middle = row + ((a + b) / 2 - late) / dt
             given = np.clip(np.floor(middle).astype(int), 0, rows - 1)
-            held = np.stack([commands[:, k, j] for j, k in enumerate(given)], -1)
+            held = np.stack([passed[:, k, j] for j, k in enumerate(given)], -1)
+            before = x
             x, z = _step(rate, x, z, held, slow, row * dt + a, b - a)
+            if slowly:
+                read = _followed(read, before, x, sensor_lag, b - a)
             if diffusion is not None and random is not None:
                 x = x + diffusion * np.sqrt(b - a) * random.standard_normal(x.shape)
     return states, tapped, commands
@@ -88,6 +99,14 @@ def _offsets(dt: float, fine: int, instants: Sequence[float]) -> list[float]:
             found.append(float(t))
     found[-1] = dt
     return found
+
+
+def _followed(read: np.ndarray, before: np.ndarray, after: np.ndarray, lag: np.ndarray, h: float) -> np.ndarray:
+    """What first-order lags read after a step in which the states moved along a line: the exact answer to a ramp."""
+    tau = np.where(lag > 0, lag, 1.0)
+    slope = (after - before) / h
+    own = after - tau * slope + (read - before + tau * slope) * np.exp(-h / tau)
+    return np.where(lag > 0, own, after)
 
 
 def _step(

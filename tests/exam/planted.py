@@ -19,21 +19,25 @@ from tests.exam.formulas import (
     crowding,
     cubic,
     exchange,
+    grip,
     inertia,
     leak,
     outflow,
     overflow,
     quadratic,
     ramp,
+    rolling,
     spring,
     stop,
     stribeck,
     swing,
     tilt,
+    understeer,
     viscous,
 )
 
 RATE, INPUT, SENSOR, DELAY, LAG, LATE_SENSOR = "rate", "input", "sensor", "delay", "lag", "late sensor"
+OWN_RATE, PLAY, SLOW_SENSOR = "own rate", "play", "slow sensor"
 ONE, SHAPE, OUTSIDE, ABSORBED = "one", "shape", "outside", "absorbed"
 
 Knobs = Mapping[str, float]
@@ -47,9 +51,10 @@ class Effect(NamedTuple):
         name: of the catalogue; a name of the exam's where the catalogue has none.
         acts_on: state, input or measured quantity.
         kind: RATE: formula(v, s, t, knobs, x, u) is added to the rate of `acts_on` (v itself, s the position or other
-            state); INPUT, SENSOR: formula(value, knobs) stands in its place; DELAY, LAG, LATE_SENSOR: one knob, s.
+            state); OWN_RATE: formula(rate, knobs, x) stands in its place; INPUT, SENSOR: formula(value, knobs) likewise;
+            DELAY, LAG, LATE_SENSOR, SLOW_SENSOR: one knob, s; PLAY: one knob, half of its width.
         full: knobs at full strength; those in `sized` are proportional to the strength, the others fixed.
-        sized: names of knobs that the strength scales. A knob `limit` shrinks instead.
+        sized: names of knobs that the strength scales. A knob `limit` shrinks instead, `_most` is divided by it.
         formula: see `kind`.
         group: ONE: in the catalogue; SHAPE: of a similar shape as the names in `accept`; OUTSIDE: nothing of the kind;
             ABSORBED: the parameters of the simulator take it in, so that nothing is missing.
@@ -74,8 +79,10 @@ class Effect(NamedTuple):
 
     def knobs(self, strength: float) -> dict[str, float]:
         """Return the parameters at a strength within 0..1."""
-        return {n: v * strength if n in self.sized else v for n, v in self.full.items()} | (
-            {"limit": self.full["limit"] * (1 - 0.7 * strength)} if "limit" in self.full else {}
+        return (
+            {n: v * strength if n in self.sized else v for n, v in self.full.items()}
+            | ({"limit": self.full["limit"] * (1 - 0.7 * strength)} if "limit" in self.full else {})
+            | ({"_most": self.full["_most"] / strength} if "_most" in self.full else {})
         )
 
 
@@ -111,6 +118,7 @@ def commands(place: str, largest: float, delay: float, lag: float, *, signed: bo
         return found
     return [
         *found,
+        Effect("input_backlash", place, PLAY, {"c": 0.3 * largest}, ("c",)),
         Effect("input_dead_zone", place, INPUT, {"d": 0.33 * largest}, ("d",), lambda u, k: beyond(u, k["d"])),
         Effect("input_gain_asymmetry", place, INPUT, {"a": 0.4}, ("a",), lambda u, k: u + k["a"] * np.abs(u)),
         Effect("input_offset", place, INPUT, {"b": 0.3 * largest}, ("b",), lambda u, k: u + k["b"]),
@@ -134,6 +142,11 @@ def scale(place: str, size: float) -> Effect:
 def late(place: str, size: float) -> Effect:
     """A sensor that reports late; with the others in time."""
     return Effect("sensor_delay", place, LATE_SENSOR, {"d": size}, ("d",), both=True)
+
+
+def slow(place: str, size: float) -> Effect:
+    """A sensor that follows with a first-order lag; with the others in time."""
+    return Effect("sensor_lag", place, SLOW_SENSOR, {"tau": size}, ("tau",), both=True)
 
 
 def rate(name: str, place: str, formula: Formula, sized: str, **full: float) -> Effect:
@@ -175,6 +188,7 @@ EFFECTS: dict[str, list[Effect]] = {
         rate("gravity_tilt", "omega", tilt, "a", a=1.5),
         Effect("added_inertia", "omega", RATE, {"alpha": 0.6}, ("alpha",), inertia),
         *commands("u", 2.5, 0.12, 0.15), bias("phi", 0.15), scale("omega", 0.25), late("omega", 0.08),
+        slow("omega", 0.08),
         shape("wide_ramp_friction", "omega", ("coulomb_friction",), 2.0, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.3)),
         shape("drag_of_power_1.5", "omega", _DRAG, 0.5, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
         outside("friction_of_position", "omega", 4.0, lambda v, s, t, k, x, u: -k["_k"] * np.sin(s) ** 2 * ramp(v, 0.05)),
@@ -188,7 +202,7 @@ EFFECTS: dict[str, list[Effect]] = {
         Effect("viscous_friction", "v", RATE, {"b": 0.4}, ("b",), viscous, ABSORBED),
         Effect("linear_stiffness", "v", RATE, {"k": 3.0}, ("k",), spring, ABSORBED),
         Effect("added_inertia", "v", RATE, {"alpha": 0.07}, ("alpha",), inertia, ABSORBED),
-        *commands("u", 3.0, 0.1, 0.12), bias("s", 0.03), scale("v", 0.25), late("v", 0.06),
+        *commands("u", 3.0, 0.1, 0.12), bias("s", 0.03), scale("v", 0.25), late("v", 0.06), slow("v", 0.05),
         shape("wide_ramp_friction", "v", ("coulomb_friction",), 1.5, lambda v, s, t, k, x, u: -k["_k"] * ramp(v, 0.06)),
         shape("drag_of_power_1.5", "v", ("quadratic_drag",), 3.0, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
         shape("spring_of_power_5", "v", ("cubic_stiffness", "end_stop"), 8000.0, lambda v, s, t, k, x, u: -k["_k"] * s**5),
@@ -204,6 +218,7 @@ EFFECTS: dict[str, list[Effect]] = {
         rate("constant_inflow", "h_1", constant, "c", c=0.6), rate("constant_inflow", "h_2", constant, "c", c=0.6),
         rate("crowding", "h_1", crowding, "k", k=4e-4),
         *commands("u", 6.0, 10.0, 12.0, signed=False), bias("h_2", 3.0), scale("h_2", 0.15), late("h_1", 8.0),
+        slow("h_1", 8.0),
         shape("weir", "h_1", ("overflow",), 0.06, lambda v, s, t, k, x, u: -k["_k"] * np.maximum(v - 35.0, 0.0) ** 1.5),
         shape("outflow_of_power_0.8", "h_2", ("outflow_exponent", "leak"), 0.06,
               lambda v, s, t, k, x, u: -k["_k"] * np.maximum(v, 0.0) ** 0.8),
@@ -215,6 +230,7 @@ EFFECTS: dict[str, list[Effect]] = {
         rate("constant_inflow", "T_2", constant, "c", c=0.12), rate("crowding", "T_1", crowding, "k", k=1e-4),
         rate("overflow", "T_1", overflow, "k", k=0.03, x_max=42.0),
         *commands("u", 1.0, 30.0, 40.0, signed=False), bias("T_2", 4.0), scale("T_1", 0.15), late("T_1", 20.0),
+        slow("T_1", 20.0),
         Effect("input_dead_zone", "u", INPUT, {"d": 0.3}, ("d",), lambda u, k: beyond(u, k["d"])),
         Effect("input_offset", "u", INPUT, {"b": 0.3}, ("b",), lambda u, k: u + k["b"]),
         shape("radiation", "T_1", ("crowding",), 0.25, lambda v, s, t, k, x, u: -k["_k"] * (((v + 273) / 320) ** 4 - 0.7)),
@@ -227,7 +243,10 @@ EFFECTS: dict[str, list[Effect]] = {
         rate("constant_load", "v", constant, "c", c=1.5),
         Effect("viscous_friction", "v", RATE, {"b": 0.15}, ("b",), viscous, ABSORBED),
         *commands("steer", 1.0, 0.15, 0.2), *commands("throttle", 1.0, 0.15, 0.2),
-        bias("theta", 0.15), bias("v", 0.3), scale("v", 0.2), late("v", 0.1),
+        bias("theta", 0.15), bias("v", 0.3), scale("v", 0.2), late("v", 0.1), slow("v", 0.1),
+        rate("rolling_resistance", "v", rolling, "c", c=2.3, _width=0.02),
+        Effect("traction_limit", "v", OWN_RATE, {"_most": 3.5}, (), grip),
+        Effect("tyre_slip", "theta", OWN_RATE, {"K": 0.15}, ("K",), understeer),
         shape("drag_of_power_1.5", "v", ("quadratic_drag",), 0.9, lambda v, s, t, k, x, u: -k["_k"] * v * np.sqrt(np.abs(v))),
         outside("drag_in_turns", "v", 1.5, lambda v, s, t, k, x, u: -k["_k"] * v * u[..., 0] ** 2),
         outside("wind", "v", 2.5, lambda v, s, t, k, x, u: k["_k"] * np.sin(x[..., 2] + 0.4)),

@@ -7,7 +7,7 @@ import numpy as np
 from tests.exam import mujoco_plants
 from tests.exam.draw import CLOSED, DERIVED, NONE, OUTLIERS, QUANTISED, SHAKEN, Set
 from tests.exam.integrate import Rate, simulate
-from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, RATE, SENSOR, Effect
+from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, OWN_RATE, PLAY, RATE, SENSOR, SLOW_SENSOR, Effect
 from tests.exam.plants import SYSTEMS, System
 from tests.exam.twins import twins
 
@@ -15,6 +15,7 @@ TRAIN, TEST, ROWS = 5, 2, 60
 PROCESS = 0.02  # of a rate's standard deviation times the square root of a row: what one row adds of process noise
 OUTLIER_SHARE, OUTLIER_SIZE = 0.02, 12.0  # of the rows; of the noise
 STEP = 2.0  # of the noise: the least digit of a quantised sensor
+SETTLED = 8.0  # lags of a slow sensor after which its start is forgotten
 DITHER = 0.1  # of the input's range, on top of a controller's command
 
 
@@ -49,8 +50,12 @@ def record(drawn: Set) -> Record:
     start, commands = system.start(random, count), system.commands(random, count, ROWS + 2)
     controller = _controller(system, random, count) if drawn.condition == CLOSED else None
     lead, share, channel = _late_sensor(system, effects, knobs)
+    settling = _settling(system, effects, knobs)
     if lead:
         commands[:, :lead] = commands[:, lead : lead + 1]
+    if settling.any():  # the sensor follows the motion before the record begins
+        lead = int(np.ceil(SETTLED * settling.max() / system.dt - 1e-9))
+        commands = np.concatenate([np.repeat(commands[:, :1], lead, axis=1), commands], axis=1)
     diffusion = None
     if drawn.condition == SHAKEN:
         quiet, _, _ = simulate(plant(system, parameters, effects, knobs), start, commands, system.dt)
@@ -64,10 +69,10 @@ def record(drawn: Set) -> Record:
         states, commands = mujoco_plants.simulate(model, start, commands, controller)
         tapped = states
     else:
-        late, slow = (_times(system, effects, knobs, kind) for kind in (DELAY, LAG))
+        late, slow, play = (_of_inputs(system, effects, knobs, kind) for kind in (DELAY, LAG, PLAY))
         states, tapped, commands = simulate(
             plant(system, parameters, effects, knobs), start, commands, system.dt, controller=controller,
-            delay=late, lag=slow, diffusion=diffusion, random=random, tap=share * system.dt,
+            delay=late, lag=slow, play=play, diffusion=diffusion, random=random, tap=share * system.dt, sensor_lag=settling,
         )  # fmt: skip
     rows = slice(lead, lead + ROWS)
     true, given = states[:, rows], commands[:, rows]
@@ -75,6 +80,8 @@ def record(drawn: Set) -> Record:
     if channel is not None:  # a late sensor reads what was `share` of a row after the row before, or the one before it
         behind = int(np.ceil(knobs[0]["d"] / system.dt - 1e-9))
         clean[..., channel] = tapped[:, lead - behind : lead - behind + ROWS, channel]
+    for i in np.flatnonzero(settling):
+        clean[..., i] = tapped[:, rows, i]
     noise = drawn.noise * clean[:TRAIN].std(axis=(0, 1))
     measured = clean + noise * random.standard_normal(clean.shape)
     return Record(true, clean, _faults(drawn, system, measured, noise, random), given, noise, parameters, knobs)
@@ -93,10 +100,12 @@ def plant(
                 u[..., j] = effect.formula(u[..., j], k)
         dx = system.rate(x, u, parameters)
         for effect, k in zip(effects, knobs, strict=True):
-            if effect.kind != RATE:
+            if effect.kind not in (RATE, OWN_RATE):
                 continue
             i = system.states.index(effect.acts_on)
-            if effect.name == "added_inertia":
+            if effect.kind == OWN_RATE:
+                dx[..., i] = effect.formula(dx[..., i], k, x)
+            elif effect.name == "added_inertia":
                 dx[..., i] /= 1 + k["alpha"]
             else:
                 partner = system.velocity.get(effect.acts_on)
@@ -129,12 +138,23 @@ def truth(drawn: Set, made: Record) -> dict[str, Any]:
     }
 
 
-def _times(system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...], kind: str) -> list[float]:
+def _of_inputs(
+    system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...], kind: str
+) -> list[float]:
     found = dict.fromkeys(system.inputs, 0.0)
     for effect, k in zip(effects, knobs, strict=True):
         if effect.kind == kind:
             found[effect.acts_on] += next(iter(k.values()))
     return list(found.values())
+
+
+def _settling(system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]) -> np.ndarray:
+    """Time constant of every state's sensor, s."""
+    found = np.zeros(len(system.states))
+    for effect, k in zip(effects, knobs, strict=True):
+        if effect.kind == SLOW_SENSOR:
+            found[system.states.index(effect.acts_on)] = k["tau"]
+    return found
 
 
 def _late_sensor(
