@@ -41,18 +41,8 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
             )
             text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(knobs, waves, strict=True))
             meaning = f"some function of {argument}"
-            terms.append(
-                Term(
-                    "unnamed",
-                    name,
-                    RATE,
-                    text,
-                    knobs,
-                    meaning,
-                    depends_on=(argument,),
-                    constants=() if turns else (size,),
-                )  # fmt: skip
-            )
+            constants = () if turns else (size,)
+            terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,), constants=constants))
     return terms
 
 
