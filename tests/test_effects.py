@@ -80,7 +80,8 @@ def values(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rates and readings with one term, parameters in the middle of their ranges."""
     together = augment(model, [term], [q.name for q in model.states])
-    p = np.concatenate([together.neutral[: len(model.params)], knobs])
+    begin = len(model.params)  # behind the knobs: constants
+    p = np.concatenate([together.neutral[:begin], knobs, together.neutral[begin + len(knobs) :]])
     rates, y = together.function(casadi.DM(x), casadi.DM(u), casadi.DM(p))
     return np.asarray(rates).ravel(), np.asarray(y).ravel()
 
@@ -301,9 +302,34 @@ def test_a_users_own_effect() -> None:
 
 def test_unnamed_functions_reach_every_argument() -> None:
     found = unnamed(PENDULUM, SCALES["pendulum"])
-    assert {t.depends_on for t in found} == {("phi",), ("omega",), ("u",)}
+    pairs = {("phi", "omega"), ("phi", "u"), ("omega", "u")}
+    assert {t.depends_on for t in found} == {("phi",), ("omega",), ("u",)} | pairs
+    two_inputs = dict.fromkeys(("x", "y", "theta", "v", "steer", "throttle"), 1.0)
+    assert {len(t.depends_on) for t in unnamed(SINGLE, Scales(two_inputs, two_inputs, 0.1))} == {
+        1
+    }  # too many arguments
     assert {t.acts_on for t in found} == {"omega"}
     assert all(k.prior == "normal" for t in found for k in t.knobs)
+
+
+def test_a_function_of_a_pair_has_the_product_of_the_priors() -> None:
+    scales = SCALES["tanks"]
+    found = {t.depends_on: t for t in unnamed(TANKS, scales) if t.acts_on == "h"}
+    pair, first, second = (found[a] for a in (("h", "u"), ("h",), ("u",)))
+    sd = lambda term, label: next(k.high / 2 for k in term.knobs if k.label == label)  # noqa: E731
+    amplitude = 0.3 * scales.rate["h"]
+    for j, k in ((1, 1), (2, 3), (3, 2)):
+        product = sd(first, f"w{j}") * sd(second, f"w{k}") / amplitude
+        np.testing.assert_allclose(sd(pair, f"w{j}{k}"), product, rtol=1e-12)
+    # one weight alone is the product of its two waves
+    x, u = [0.3, 0.5], [0.7]
+    one = [float(k.label == "w23") for k in pair.knobs]
+    waves = [
+        push(TANKS, term, x, u, [float(k.label == label) for k in term.knobs])[0]
+        for term, label in ((first, "w2"), (second, "w3"))
+    ]
+    assert abs(waves[0] * waves[1]) > 0.01
+    np.testing.assert_allclose(push(TANKS, pair, x, u, one)[0], waves[0] * waves[1], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

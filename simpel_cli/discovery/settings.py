@@ -13,13 +13,13 @@ class Discovery:
         horizon: how far ahead errors are judged, in rows.
         substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 2 at most.
         lanes: fits that run side by side in the compiled program.
-        room: unknowns of effects that a hypothesis can have at once.
+        room: unknowns of effects that a hypothesis can have at once; a function of two arguments has 9, time grows with it.
     """
 
     horizon: int = 20
     substeps: int | None = None
     lanes: int = 4
-    room: int = 9
+    room: int = 11
 
     def __post_init__(self) -> None:
         for name in ("horizon", "lanes", "room"):

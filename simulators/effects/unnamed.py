@@ -1,11 +1,13 @@
 """Functions without a physical name: what SimPEL's gap GP says, as hypotheses that a named effect has to beat.
 
     f(a) = sum_j w_j phi_j(a),    w_j ~ N(0, S(omega_j)),    phi_j the sines of a box somewhat wider than the data
+    f(a, b) = sum_jk w_jk phi_j(a) phi_k(b),    w_jk ~ N(0, S(omega_j) S(omega_k)):    the product of two such kernels
 
 Reference: Solin and Sarkka (2020), Hilbert space methods for reduced-rank Gaussian process regression, eq. 16.
 """
 
 import math
+from itertools import combinations
 
 from numpy.polynomial import chebyshev, polynomial
 
@@ -18,10 +20,12 @@ BASES = 6
 BOX = 1.3  # half width, in largest magnitudes of the argument
 LENGTHSCALE = 0.6  # of the GP, likewise
 AMPLITUDE = 0.3  # of the GP, in typical rates
+PAIR_BASES = 3  # per argument of a pair
+MOST_ARGUMENTS = 4  # of a model that is offered pairs: their number grows with the square, and programs with it
 
 
 def unnamed(model: Model, scales: Scales) -> list[Term]:
-    """Return one function of each state and each input, for every rate that something may be missing from."""
+    """Return one function of each state, input and pair of these, for every rate that something may be missing from."""
     terms = []
     units = {q.name: q.unit for q in model.states}
     periodic = {q.name for q in model.states if q.periodic}
@@ -43,6 +47,39 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
             meaning = f"some function of {argument}"
             constants = () if turns else (size,)
             terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,), constants=constants))
+        terms += _pairs(name, per(units[name], "s"), model, scales)
+    return terms
+
+
+def _pairs(name: str, unit: str, model: Model, scales: Scales) -> list[Term]:
+    """Return one function of every two arguments of which a state is one."""
+    states, inputs = [q.name for q in model.states], [q.name for q in model.inputs]
+    periodic = {q.name for q in model.states if q.periodic}
+    terms: list[Term] = []
+    if len(states) + len(inputs) > MOST_ARGUMENTS:
+        return terms
+    bases = {}
+    for a in (*states, *inputs):
+        waves, shares = _harmonics(a) if a in periodic else _sines(a, f"size_of_{a}")
+        bases[a] = list(zip(waves, shares, strict=True))[:PAIR_BASES]
+    for a, b in combinations((*states, *inputs), 2):
+        if a not in states:
+            continue
+        knobs, sums = [], []
+        for j, (wave, share) in enumerate(bases[a], start=1):
+            row = []
+            for k, (other, other_share) in enumerate(bases[b], start=1):
+                label, sd = f"w{j}{k}", AMPLITUDE * scales.rate[name] * share * other_share
+                knobs.append(
+                    Knob(f"unnamed_{name}_of_{a}_{b}_{label}", label, unit, -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
+                )
+                row.append(f"{knobs[-1].name}*{other}")
+            sums.append(f"{wave}*({' + '.join(row)})")
+        constants = tuple((f"size_of_{c}", scales.size[c]) for c in (a, b) if c not in periodic)
+        meaning = f"some function of {a} and {b}"
+        terms.append(
+            Term("unnamed", name, RATE, " + ".join(sums), tuple(knobs), meaning, depends_on=(a, b), constants=constants)
+        )
     return terms
 
 
