@@ -301,11 +301,11 @@ def test_a_users_own_effect() -> None:
 
 
 def test_unnamed_functions_reach_every_argument() -> None:
-    found = unnamed(PENDULUM, SCALES["pendulum"])
+    found = unnamed(PENDULUM, SCALES["pendulum"], pairs=True)
     pairs = {("phi", "omega"), ("phi", "u"), ("omega", "u")}
     assert {t.depends_on for t in found} == {("phi",), ("omega",), ("u",)} | pairs
     two_inputs = dict.fromkeys(("x", "y", "theta", "v", "steer", "throttle"), 1.0)
-    assert {len(t.depends_on) for t in unnamed(SINGLE, Scales(two_inputs, two_inputs, 0.1))} == {
+    assert {len(t.depends_on) for t in unnamed(SINGLE, Scales(two_inputs, two_inputs, 0.1), pairs=True)} == {
         1
     }  # too many arguments
     assert {t.acts_on for t in found} == {"omega"}
@@ -314,7 +314,7 @@ def test_unnamed_functions_reach_every_argument() -> None:
 
 def test_a_function_of_a_pair_has_the_product_of_the_priors() -> None:
     scales = SCALES["tanks"]
-    found = {t.depends_on: t for t in unnamed(TANKS, scales) if t.acts_on == "h"}
+    found = {t.depends_on: t for t in unnamed(TANKS, scales, pairs=True) if t.acts_on == "h"}
     pair, first, second = (found[a] for a in (("h", "u"), ("h",), ("u",)))
     sd = lambda term, label: next(k.high / 2 for k in term.knobs if k.label == label)  # noqa: E731
     amplitude = 0.3 * scales.rate["h"]

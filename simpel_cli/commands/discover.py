@@ -88,6 +88,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         declared_noise,
         effects,
         options.substeps,
+        pairs=options.pairs,
     )
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from simpel_cli.errors import ConfigError
 
+PAIR = 11  # unknowns of a function of two arguments beside an effect
+
 
 @dataclass(frozen=True)
 class Discovery:
@@ -13,15 +15,21 @@ class Discovery:
         horizon: how far ahead errors are judged, in rows.
         substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 2 at most.
         lanes: fits that run side by side in the compiled program.
-        room: unknowns of effects that a hypothesis can have at once; a function of two arguments has 9, time grows with it.
+        room: unknowns of effects that a hypothesis can have at once; time grows with it.
+        pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
     """
 
     horizon: int = 20
     substeps: int | None = None
     lanes: int = 4
-    room: int = 11
+    room: int = 9
+    pairs: bool = False
 
     def __post_init__(self) -> None:
+        if self.pairs and self.room < PAIR:
+            raise ConfigError(
+                f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
+            )
         for name in ("horizon", "lanes", "room"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"discovery.{name}: got {getattr(self, name)}; it must be at least 1.")

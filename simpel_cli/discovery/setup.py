@@ -42,6 +42,8 @@ def setup(
     declared_noise: Sequence[str],
     effects: Sequence[Expression],
     substeps: int | None = None,
+    *,
+    pairs: bool = False,
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -51,6 +53,7 @@ def setup(
         declared_noise: names of the channels whose noise the user declared.
         effects: the catalogue, or what of it is to be tried.
         substeps: Runge-Kutta steps per row; None: as many as the noise asks for.
+        pairs: offer functions of two arguments.
 
     Raises:
         DataError: too few rows.
@@ -68,7 +71,9 @@ def setup(
     measured = tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
     scales = scales_of(model, recording.train, measured, recording.outputs)
     try:
-        terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(model, scales)
+        terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(
+            model, scales, pairs=pairs
+        )
     except ModelError as error:
         raise ConfigError(str(error)) from error
     augmented = augment(model, terms, measured)

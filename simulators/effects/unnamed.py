@@ -24,8 +24,8 @@ PAIR_BASES = 3  # per argument of a pair
 MOST_ARGUMENTS = 4  # of a model that is offered pairs: their number grows with the square, and programs with it
 
 
-def unnamed(model: Model, scales: Scales) -> list[Term]:
-    """Return one function of each state, input and pair of these, for every rate that something may be missing from."""
+def unnamed(model: Model, scales: Scales, *, pairs: bool = False) -> list[Term]:
+    """Return one function of each state and input, or pair of these, for every rate that something may be missing from."""
     terms = []
     units = {q.name: q.unit for q in model.states}
     periodic = {q.name for q in model.states if q.periodic}
@@ -47,7 +47,8 @@ def unnamed(model: Model, scales: Scales) -> list[Term]:
             meaning = f"some function of {argument}"
             constants = () if turns else (size,)
             terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,), constants=constants))
-        terms += _pairs(name, per(units[name], "s"), model, scales)
+        if pairs:
+            terms += _pairs(name, per(units[name], "s"), model, scales)
     return terms
 
 
