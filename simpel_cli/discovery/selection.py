@@ -18,8 +18,9 @@ from simulators.effects import Term
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 TIE = 3.0  # nats within which two names are not told apart
 PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
-SHARE = 0.2  # of the largest promise, likewise
-KEPT = 6  # starts of a stage that are fitted in any case
+SHARE = 0.3  # of the largest promise, likewise
+SHARE_OF_OWN = 0.4  # of what the term promises whose place a rival would take
+KEPT = 4  # starts of a stage that are fitted in any case
 MOST_EFFECTS = 5
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 STARTS = 6  # of the model as it is
@@ -132,15 +133,25 @@ class Search:
         self.known[name] = max([*found, *known], key=lambda o: o.log_evidence)
         return Trial(terms, self.known[name])
 
-    def add(self, before: Trial, candidates: Sequence[int]) -> Stage:
-        """Fit `before` with one of the candidates more, each from its promising starts; best first."""
+    def starts(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Lane]]:
+        """Return every start of every candidate."""
+        return [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
+
+    def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING) -> Stage:
+        """Fit `before` with one of the candidates more, each from its promising starts; best first.
+
+        Args:
+            before: the model without it.
+            candidates: terms.
+            least: nats that a start must promise to be fitted.
+        """
         self.tried += len(candidates)
-        starts = [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
+        starts = self.starts(before, candidates)
         scores = promises(self, before, starts)
         promised = np.array([score.gain for score in scores])
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
         finite = promised[np.isfinite(promised)]
-        least = max(PROMISING, SHARE * float(finite.max(initial=0.0)))
+        least = max(least, SHARE * float(finite.max(initial=0.0)))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > least]
         found = self.fitter([starts[i][1] for i in going])
         fits: dict[int, list[Optimum]] = {}
@@ -234,7 +245,9 @@ class Search:
     def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
         """Return the trials in which another name takes the place of the term that `rest` lacks, and does as well."""
         (own,) = set(chosen.terms) - set(rest.terms)
-        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own]).trials
+        own_scores = [s.gain for s in promises(self, rest, self.starts(rest, [own])) if np.isfinite(s.gain)]
+        least = max(PROMISING, SHARE_OF_OWN * max(own_scores, default=0.0))
+        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own], least).trials
         top, own_effect = chosen.optimum.log_evidence, self.terms[own].effect
         return tuple(
             t
