@@ -216,7 +216,38 @@ class Search:
             path = [t for t in path if set(t.terms) <= set(chosen.terms)]
             path = path if path[-1].terms == chosen.terms else [*path, chosen]
         classes = tuple(self.rivals(chosen, rest) for rest in without)
-        return Selection(base, chosen, tuple(path), classes, tuple(stages), gains, remainder, self.tried)
+        found = Selection(base, chosen, tuple(path), classes, tuple(stages), gains, remainder, self.tried)
+        return self.named(found)
+
+    def named(self, found: Selection) -> Selection:
+        """Take out the effects that a function without a name beats; what it depends on is the remainder."""
+        unnamed = [next((t for t in rivals if self.terms[t.terms[-1]].depends_on), None) for rivals in found.classes]
+        beaten = [i for i, trial in enumerate(unnamed) if trial is not None]
+        if not beaten:
+            return found
+        kept = [i for i in range(len(unnamed)) if i not in beaten]
+        rest = tuple(found.chosen.terms[i] for i in kept)
+        chosen = self.best(rest, self.fitter(self.less(found.chosen, rest)))
+        path = [t for t in found.path if set(t.terms) <= set(rest)]
+        path = path if set(path[-1].terms) == set(rest) else [*path, chosen]
+        winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
+        gain = float(winner.optimum.log_evidence - chosen.optimum.log_evidence)
+        return found._replace(
+            base=found.base if rest else chosen,
+            chosen=chosen,
+            path=(*path[:-1], chosen),
+            classes=tuple(found.classes[i] for i in kept),
+            gains=tuple(found.gains[i] for i in kept),
+            remainder=(self.terms[winner.terms[-1]], gain),
+        )
+
+    def less(self, current: Trial, rest: tuple[int, ...]) -> list[Lane]:
+        """Starts of a set of terms that has fewer than the current one."""
+        z = self.off(current.optimum.z, tuple(t for t in current.terms if t not in rest))
+        n_p, n_r, n_q = self.plan.coordinates.sizes
+        loud = z.copy()  # the noise that the terms explained has to go somewhere
+        loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
+        return [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
 
     def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
         """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""
@@ -232,13 +263,7 @@ class Search:
     def without(self, current: Trial) -> list[Trial]:
         """Fit every set that lacks one of the terms."""
         sets = [tuple(t for t in current.terms if t != gone) for gone in current.terms]
-        lanes = []
-        for gone, rest in zip(current.terms, sets, strict=True):
-            z = self.off(current.optimum.z, (gone,))
-            n_p, n_r, n_q = self.plan.coordinates.sizes
-            loud = z.copy()  # the noise that the term explained has to go somewhere
-            loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
-            lanes += [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
+        lanes = [lane for rest in sets for lane in self.less(current, rest)]
         found = self.fitter(lanes)
         return [self.best(rest, found[2 * i : 2 * i + 2]) for i, rest in enumerate(sets)]
 

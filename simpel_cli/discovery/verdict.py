@@ -11,7 +11,6 @@ from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
 from simpel_cli.discovery.twins import twins
 from simpel_cli.discovery.whiteness import memory
 from simpel_cli.discovery.windows import Windows
-from simulators.effects import Term
 from simulators.effects.expression import per
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
@@ -45,12 +44,9 @@ def verdict_of(
         horizon: rows.
         seconds: of the search.
     """
-    chosen, terms = selection.chosen, search.terms
-    named = [
-        not any(terms[t.terms[-1]].depends_on for t in rivals) for rivals in selection.classes
-    ]  # not beaten by a function without a name
-    effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i, ok in enumerate(named) if ok]
-    remainder = _remainder(search, selection, named) or _followed(search, selection.chosen, learnt)
+    chosen = selection.chosen
+    effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i in range(len(chosen.terms))]
+    remainder = _remainder(search, selection) or _followed(search, chosen, learnt)
     different = [_distinct(e) for e in effects]
     if not effects:
         kind = UNEXPLAINED if remainder else NONE
@@ -151,19 +147,10 @@ def _distinct(effect: dict[str, Any]) -> list[str]:
     return [n for n in effect["class"] if n == effect["name"] or n not in effect["same_as"]]
 
 
-def _remainder(search: Search, selection: Selection, named: list[bool]) -> dict[str, Any] | None:
-    beaten = [
-        next(t for t in rivals if search.terms[t.terms[-1]].depends_on)
-        for rivals, ok in zip(selection.classes, named, strict=True)
-        if not ok
-    ]
-    if beaten:
-        term: Term = search.terms[beaten[0].terms[-1]]
-        gain = beaten[0].optimum.log_evidence - selection.base.optimum.log_evidence
-    elif selection.remainder is not None:
-        term, gain = selection.remainder
-    else:
+def _remainder(search: Search, selection: Selection) -> dict[str, Any] | None:
+    if selection.remainder is None:
         return None
+    term, gain = selection.remainder
     scale = search.plan.scales.rate[term.acts_on]
     level = _noise(search, selection.chosen)[1]
     unit = term.knobs[0].unit
