@@ -2,7 +2,8 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gate
 from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
+from simpel_cli.discovery.residual import Forces
 from simpel_cli.discovery.selection import Search, Selection, Trial
 from simpel_cli.discovery.settings import Discovery
-from simpel_cli.discovery.setup import Setup, setup, test_windows
+from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
+from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
 from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
@@ -32,7 +35,7 @@ from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.nodes import build
 from simpel_cli.records import strict, write_table, write_text
 from simpel_cli.run import Manifest, make_directory, refuse_occupied
-from simulators.effects import Expression
+from simulators.effects import Expression, Term
 from simulators.model import Model
 
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
@@ -82,14 +85,9 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     recording = clean.recording
     bad = [c for c in recording.checks if not c.ok]
     terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")
-    plan = setup(
-        model,
-        recording,
-        declared_noise,
-        effects,
-        options.substeps,
-        pairs=options.pairs,
-    )
+    attach = partial(setup, model, recording, declared_noise, effects, options.substeps, pairs=options.pairs)
+    kept = _kept(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal)
+    plan = attach(kept=kept)
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
     assessor = Assessor(plan, options.horizon)
@@ -138,6 +136,29 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         write_table(directory / f"{name}.parquet", table.columns, table.units)
     publish(terminal, found, directory, config)
     return found
+
+
+def _kept(
+    attach: Callable[..., Setup], terms: Sequence[Term], options: Discovery, terminal: Terminal
+) -> frozenset[Key] | None:
+    """Say which terms get a place in the program; None: all of them."""
+    unknowns = sum(len(t.knobs) for t in terms)
+    if unknowns <= MOST_KNOBS:
+        return None
+    terminal.line(
+        f"{len(terms)} terms with {unknowns} unknowns: calibrating the simulator alone, to choose", "screening"
+    )
+    plan = attach(kept=frozenset())
+    width = len(plan.augmented.model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
+    base = Search(plan, fitter).base()
+    forces = Forces(plan.rule, plan.coordinates, plan.augmented.model.dt)
+    z = base.optimum.z
+    force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
+    kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
+    left = sum(len(t.knobs) for t in terms if key_of(t) in kept)
+    terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
+    return kept
 
 
 def _calibrated(

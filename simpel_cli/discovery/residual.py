@@ -114,6 +114,11 @@ class Forces:
         variance = np.maximum(np.diagonal(smoothed.moved_cov, axis1=-2, axis2=-1), 0.0)
         return Force(smoothed.mean, force, np.sqrt(variance) / self.dt)
 
+    def inputs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
+        """Return the inputs as they arrive, (W, T, nu), the mean of every row."""
+        p, _ = self.coordinates.physical(jnp.asarray(z))
+        return np.asarray(self._arriving(p, jnp.asarray(windows.u))).mean(axis=2)
+
     def following(self, z: np.ndarray, state: np.ndarray, windows: Windows) -> np.ndarray:
         """Return where the model takes every state, (W, T, nx), in one row."""
         p, _ = self.coordinates.physical(jnp.asarray(z))

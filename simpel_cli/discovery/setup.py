@@ -1,7 +1,7 @@
 """From a simulator, measurements and a catalogue of effects to everything that a search needs."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
-FOLDS = 5
+
+Key: TypeAlias = tuple[str, str, tuple[str, ...]]
 PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
 
 
@@ -44,6 +45,7 @@ def setup(
     substeps: int | None = None,
     *,
     pairs: bool = False,
+    kept: Collection[Key] | None = None,
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -54,6 +56,7 @@ def setup(
         effects: the catalogue, or what of it is to be tried.
         substeps: Runge-Kutta steps per row; None: as many as the noise asks for.
         pairs: offer functions of two arguments.
+        kept: terms to attach; None: all.
 
     Raises:
         DataError: too few rows.
@@ -68,18 +71,15 @@ def setup(
         raise DataError(
             "data.layout: discover follows episodes in time; give layout `trajectories`, not `transitions`."
         )
-    measured = tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
+    measured = measured_of(model, recording)
     scales = scales_of(model, recording.train, measured, recording.outputs)
-    try:
-        terms: list[Term] = [t for e in effects for t in e.attach(model, scales, measured)] + unnamed(
-            model, scales, pairs=pairs
-        )
-    except ModelError as error:
-        raise ConfigError(str(error)) from error
+    every = terms_of(model, recording, effects, pairs=pairs)
+    terms = [t for t in every if kept is None or key_of(t) in kept]
     augmented = augment(model, terms, measured)
-    longest = max((k.high for t in terms if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
+    # of all of them, so that windows do not depend on what is kept
+    longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
-    if any(t.kind == BACKLASH for t in terms):
+    if any(t.kind == BACKLASH for t in every):
         lead = max(lead, PLAY_ROWS)
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
     middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
@@ -110,6 +110,31 @@ def setup(
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
     return Setup(augmented, rule, coordinates, windows, scales, start, lead, substeps)
+
+
+def measured_of(model: Model, recording: Recording) -> tuple[str, ...]:
+    """Return the names of the measured states and outputs."""
+    return tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
+
+
+def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], *, pairs: bool = False) -> list[Term]:
+    """Return every effect at every place, and the functions without a name.
+
+    Raises:
+        ConfigError: an effect that names what the model does not have.
+    """
+    measured = measured_of(model, recording)
+    scales = scales_of(model, recording.train, measured, recording.outputs)
+    try:
+        named = [t for e in effects for t in e.attach(model, scales, measured)]
+    except ModelError as error:
+        raise ConfigError(str(error)) from error
+    return named + unnamed(model, scales, pairs=pairs)
+
+
+def key_of(term: Term) -> Key:
+    """Return what a term is called by: effect, place, arguments."""
+    return term.effect, term.acts_on, term.depends_on
 
 
 def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str], outputs: Sequence[str]) -> Scales:
