@@ -22,6 +22,8 @@ SHARE = 0.3  # of the largest promise, likewise
 SHARE_OF_OWN = 0.4  # of what the term promises whose place a rival would take
 KEPT = 4  # starts of a stage that are fitted in any case
 MOST_EFFECTS = 5
+ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
+NEARLY = 0.01  # of a knob's range
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 STARTS = 6  # of the model as it is
 
@@ -99,6 +101,13 @@ class Search:
             lanes.append(Lane(start, self.free(terms), self.ones if weight is None else weight))
         return lanes
 
+    def beside(self, before: Trial, new: int) -> Lane:
+        """Start of a model with one term more at the optimum without it, the term all but switched off."""
+        start = before.optimum.z.copy()
+        for row in self.rows[new]:
+            start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
+        return Lane(start, self.free((*before.terms, new)), self.ones)
+
     def off(self, z: np.ndarray, terms: Sequence[int]) -> np.ndarray:
         """Switch terms off."""
         z = z.copy()
@@ -157,6 +166,10 @@ class Search:
         fits: dict[int, list[Optimum]] = {}
         for i, optimum in zip(going, found, strict=True):
             fits.setdefault(starts[i][0], []).append(optimum)
+        # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
+        astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
+        for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
+            fits[t].append(optimum)
         trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
         left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
         ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)

@@ -9,13 +9,14 @@ from typing import Any
 
 from tests.exam.draw import Set
 from tests.exam.examine import examine
+from tests.exam.plants import SYSTEMS
 
 SETS_PER_PROCESS = 40  # then a fresh one: compiled programs take memory
 
 
-def neighbours(drawn: Set) -> tuple[str, tuple[str, ...], int]:
-    """Sets that share compiled programs are next to each other."""
-    return drawn.system, drawn.measured, drawn.index
+def neighbours(drawn: Set) -> tuple[int, str, tuple[str, ...], int]:
+    """Sets that share compiled programs are next to each other, small systems first."""
+    return len(SYSTEMS[drawn.system].states), drawn.system, drawn.measured, drawn.index
 
 
 def run(waiting: list[Set], out: Path, thresholds: dict[str, float], workers: int) -> None:
