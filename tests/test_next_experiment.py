@@ -163,7 +163,7 @@ def tied() -> tuple[Search, Selection]:
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=8))
     base = search.base()
     effects = [t.effect for t in search.terms]
-    trials = search.add(base, [effects.index("coulomb_friction"), effects.index("viscous_friction")])
+    trials = search.add(base, [effects.index("coulomb_friction"), effects.index("viscous_friction")]).trials
     chosen, rival = trials
     stages = (Stage(base, tuple(trials)),)
     return search, Selection(base, chosen, (base, chosen), ((rival,),), stages, (9.0,), None, 2)
