@@ -189,9 +189,10 @@ def _gated(
         judged = gate(search, assessor, before, after)
         gates.append(judged)
         added = [search.terms[t].label for t in after.terms if t not in before.terms]
+        why = "the errors ahead grow" if judged.harm else "not certain"
         terminal.line(
             f"{' and '.join(added)}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
-            f" by {judged.unit}{'' if judged.passed else ', not certain: not accepted'}",
+            f" by {judged.unit}{'' if judged.passed else f', {why}: not accepted'}",
             "gate",
         )
         if not judged.passed:

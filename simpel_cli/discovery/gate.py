@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.assess import Assessor, gain_interval
+from simpel_cli.discovery.assess import Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.selection import Search, Trial
 
@@ -21,13 +21,16 @@ class Gate(NamedTuple):
         gain: nats, summed over all held-out parts.
         low, high: 95 % interval, by resampling episodes (or windows, where there are few episodes).
         unit: what was held out at a time.
-        passed: whether the lower end is positive.
+        harm: whether the errors some rows ahead grow, of every channel and certainly: a model that predicts the next row
+            better and all others worse has learnt to follow.
+        passed: whether the lower end is positive and there is no harm.
     """
 
     gain: float
     low: float
     high: float
     unit: str
+    harm: bool
     passed: bool
 
 
@@ -50,9 +53,14 @@ def gate(search: Search, assessor: Assessor, before: Trial, after: Trial) -> Gat
     # how loud the noise is says nothing about the effect: both models fit it anew on what was held out
     found = search.fitter([Lane(o.z, search.noise, 1 - lane.weight) for o, lane in zip(found, lanes, strict=True)])
     gains = np.zeros(len(windows.episode))
+    ahead = np.zeros((2, *windows.y.shape))
     for i, weight in enumerate(kept):
-        old, new = (assessor(found[i + k * len(folds)].z, windows).log_likelihood for k in (0, 1))
-        gains += np.where(weight == 0, new - old, 0.0)
+        old, new = (assessor(found[i + k * len(folds)].z, windows) for k in (0, 1))
+        gains += np.where(weight == 0, new.log_likelihood - old.log_likelihood, 0.0)
+        for k, errors in enumerate((old.ahead, new.ahead)):
+            ahead[k, weight == 0] = errors[weight == 0]
     per_group = np.array([gains[groups == name].sum() for name in names])
+    ratios = reduction_interval(ahead[0], ahead[1], groups, np.random.default_rng(1))[1]
+    harm = bool(np.isfinite(ratios).any() and np.all(ratios[np.isfinite(ratios)] < 1))
     low, high = gain_interval(per_group, np.random.default_rng(1))
-    return Gate(float(gains.sum()), low, high, unit, bool(low > 0))
+    return Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm)

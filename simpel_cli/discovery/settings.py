@@ -13,7 +13,7 @@ class Discovery:
 
     Args:
         horizon: how far ahead errors are judged, in rows.
-        substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 2 at most.
+        substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 8 at most.
         lanes: fits that run side by side in the compiled program.
         room: unknowns of effects that a hypothesis can have at once; time grows with it.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.

@@ -9,7 +9,8 @@ from simulators.effects import Scales, structure
 from simulators.model import Model
 
 TOLERANCE = 0.05  # of the measurement noise, in one row of a smooth model
-MOST = 2  # a friction that changes sign within a row would ask for ever more
+MOST = 8
+MOST_OF_SWITCHES = 2  # a friction that changes sign within a row would ask for ever more
 ROWS = 300  # looked at
 SWITCH = 0.1  # a force that changes sign within a row, in typical rates: a step misses up to a sixth of twice it
 
@@ -38,15 +39,16 @@ def substeps_needed(
         return np.asarray(function(x, u, p)[0])
 
     names = [q.name for q in model.states]
-    finest = _moved(rate, x, model.dt, 8 * MOST)
-    for steps in range(1, MOST):
+    finest = _moved(rate, x, model.dt, 4 * MOST)
+    least = min(MOST_OF_SWITCHES, int(np.ceil(_of_switches(model, noise_std, scales))))
+    for steps in range(max(least, 1), MOST):
         missed = np.abs(_moved(rate, x, model.dt, steps) - finest)
         smooth = all(
             np.nanquantile(missed[names.index(name)], 0.99) < TOLERANCE * std
             for name, std in noise_std.items()
             if name in names
         )
-        if smooth and steps >= _of_switches(model, noise_std, scales):
+        if smooth:
             return steps
     return MOST
 

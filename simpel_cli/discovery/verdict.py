@@ -240,7 +240,8 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         ratio = first / second
     best = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else 0
     steps = found["error"]["horizon_steps"]
-    gain = f"The error {steps} rows ahead in {measured[best]} falls from {first[best]:.3g} to {second[best]:.3g}."
+    goes = "falls" if second[best] < first[best] else "does not fall: it goes"
+    gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
     parts = [_phrase(e) for e in found["effects"]]
     listed = " and ".join(parts)
     match found["verdict"]:
