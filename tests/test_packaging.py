@@ -44,16 +44,17 @@ def test_the_lock_is_of_this_project() -> None:
     assert {d["name"] for d in own["dependencies"]} == required
 
 
-@pytest.mark.parametrize("path", ["/tmp/x", "see /home/ann/runs", "'/root/x'", "(/work/x)"])  # simpel: not a path here
-def test_the_search_finds_paths(path: str) -> None:
-    assert MACHINE.search(path)
+@pytest.mark.parametrize("text", ["{}tmp/x", "see {}home/ann/runs", "'{}root/x'", "({}work/x)"])
+def test_the_search_finds_paths(text: str) -> None:
+    assert MACHINE.search(text.format("/"))
+    assert not MACHINE.search(text.format("sub/"))
 
 
 def test_no_path_of_a_developers_machine_in_git() -> None:
     found = []
     for name in git("ls-files"):
         path = ROOT / name
-        if not path.is_file() or name == "tests/test_packaging.py":
+        if not path.is_file():
             continue
         try:
             text = path.read_text()

@@ -116,7 +116,7 @@ def _work(job: Job) -> Outcome:
         fit(job)
     except SimpelError as error:
         return Outcome(job.directory, error.exit_code, str(error))
-    except Exception:
+    except Exception:  # whatever it is, it costs this job and no other; the traceback is kept beside it
         text = traceback.format_exc()
         job.directory.mkdir(parents=True, exist_ok=True)
         (job.directory / "traceback.txt").write_text(text)

@@ -1,12 +1,14 @@
 """How many Runge-Kutta steps a row needs, so that the integrator errs less than the sensors do."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from simpel_cli.data.recording import Episode
 from simulators.effects import Scales, structure
 from simulators.model import Model
+from simulators.worlds.rk4 import RK4
 
 TOLERANCE = 0.05  # of the measurement noise, in one row of a smooth model
 MOST = 8
@@ -30,21 +32,21 @@ def substeps_needed(
     states = np.concatenate([e.states for e in episodes])
     middle = np.array([(q.low + q.high) / 2 for q in model.states])
     kept = np.unique(np.linspace(0, len(states) - 1, min(ROWS, len(states))).astype(int))
-    x = np.where(np.isfinite(states), states, middle)[kept].T
-    u = np.nan_to_num(np.concatenate([e.inputs for e in episodes])[kept].T)
-    function = model.function()
-    p = np.tile(np.asarray(at, float)[:, None], len(kept))
+    x = np.where(np.isfinite(states), states, middle)[kept]
+    u = np.nan_to_num(np.concatenate([e.inputs for e in episodes])[kept])
+    p = np.tile(np.asarray(at, float), (len(kept), 1))
 
-    def rate(x: np.ndarray) -> np.ndarray:
-        return np.asarray(function(x, u, p)[0])
+    def moved(steps: int) -> np.ndarray:
+        # when an input arrives does not matter here
+        return RK4(replace(model, substeps=steps, delay={}, lag={})).step(x, u, p)
 
     names = [q.name for q in model.states]
-    finest = _moved(rate, x, model.dt, 4 * MOST)
+    finest = moved(4 * MOST)
     least = min(MOST_OF_SWITCHES, int(np.ceil(_of_switches(model, noise_std, scales))))
     for steps in range(max(least, 1), MOST):
-        missed = np.abs(_moved(rate, x, model.dt, steps) - finest)
+        missed = np.abs(moved(steps) - finest)
         smooth = all(
-            np.nanquantile(missed[names.index(name)], 0.99) < TOLERANCE * std
+            np.nanquantile(missed[:, names.index(name)], 0.99) < TOLERANCE * std
             for name, std in noise_std.items()
             if name in names
         )
@@ -61,14 +63,3 @@ def _of_switches(model: Model, noise_std: dict[str, float], scales: Scales) -> f
         if known > 0:
             needed = max(needed, SWITCH * scales.rate[velocity] * model.dt / known)
     return needed
-
-
-def _moved(rate: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float, steps: int) -> np.ndarray:
-    h = dt / steps
-    for _ in range(steps):
-        k1 = rate(x)
-        k2 = rate(x + h / 2 * k1)
-        k3 = rate(x + h / 2 * k2)
-        k4 = rate(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return x

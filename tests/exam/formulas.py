@@ -91,7 +91,8 @@ def swing(v, s, t, k, x, u):
 
 
 def inertia(v, s, t, k, x, u):
-    raise NotImplementedError("scales the whole rate: see record.plant")
+    # it scales the model's whole rate, which no formula of these arguments can; `record.plant` does so itself
+    raise AssertionError("added inertia is no term: record.plant scales the rate")
 
 
 def rolling(v, s, t, k, x, u):

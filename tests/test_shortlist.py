@@ -1,0 +1,40 @@
+"""Which terms a large model is offered, by a latent force that is known."""
+
+import numpy as np
+import pytest
+
+from simpel_cli.discovery import shortlist as module
+from simpel_cli.discovery.residual import Force
+from simpel_cli.discovery.setup import key_of
+from simpel_cli.discovery.shortlist import shortlist
+from tests.test_twins import searched
+
+
+@pytest.mark.parametrize(("force", "name"), [("drag", "drag"), ("load", "load"), ("input", None)])
+def test_the_term_that_the_latent_force_looks_like_is_kept(
+    monkeypatch: pytest.MonkeyPatch, force: str, name: str | None
+) -> None:
+    """One place for a named effect: drag, a load, or nothing where a known parameter takes it all."""
+    monkeypatch.setattr(module, "NAMED", 1)
+    monkeypatch.setattr(module, "UNNAMED", 0)
+    search = searched("b")
+    plan = search.plan
+    random = np.random.default_rng(1)
+    count, rows = plan.windows.y.shape[:2]
+    state, u = random.normal(size=(count, rows, 2)), random.normal(size=(count, rows, 1))
+    v = state[..., 1]
+    pushed = {"drag": -0.4 * v * np.abs(v), "load": 0.4 + 0 * v, "input": 0.1 * u[..., 0]}[force]
+    latent = np.stack([0 * v, pushed + 0.02 * random.normal(size=v.shape)], axis=-1)[:, :-1]
+    kept = shortlist(plan, plan.start, Force(state, latent, np.full_like(latent, 0.02)), u, search.terms)
+    gains = dict(
+        zip(
+            map(key_of, search.terms),
+            module._gains(plan, plan.start, Force(state, latent, latent), u, search.terms),
+            strict=True,
+        )
+    )
+    best = max(gains.values())
+    if name is None:
+        assert best < 0.05 * float(np.sum((pushed[:, :-1] / 0.02) ** 2))
+    else:
+        assert {key[0] for key in kept} == {name}
