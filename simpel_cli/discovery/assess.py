@@ -92,7 +92,10 @@ def reduction_interval(
     chosen = random.integers(0, len(names), (draws, len(names)))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
-    return np.nanquantile(ratio, [0.025, 0.975], axis=0)
+    told = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
+    interval = np.full((2, ratio.shape[1]), np.nan)
+    interval[:, told] = np.nanquantile(ratio[:, told], [0.025, 0.975], axis=0)
+    return interval
 
 
 def gain_interval(gain: np.ndarray, random: np.random.Generator, draws: int = 4000) -> tuple[float, float]:
