@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".pytest_cache" / "cache"  # compiled programs are shared by all tests and their processes
+PATIENCE = 1800.0  # s for a process that hangs; a loaded machine is no failure
 TINY = (
     "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64",
     "run.quiet=true",
@@ -94,7 +95,7 @@ def start(cwd: Path, *words: object, **options: object) -> subprocess.Popen[str]
     )
 
 
-def process(cwd: Path, *words: object, timeout: float = 240) -> Result:
+def process(cwd: Path, *words: object, timeout: float = PATIENCE) -> Result:
     """Run the command as a process of its own."""
     with start(cwd, *words) as child:
         out, err = child.communicate(timeout=timeout)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from command_line import process, simpel, start
+from command_line import PATIENCE, process, simpel, start
 
 FIT = (
     "fit", "experiment=pendulum", "method.steps=6000", "method.particles=6", "method.network.hidden=[32,32]",
@@ -42,7 +42,7 @@ def stop(folder: Path, run: Path, words: tuple[object, ...], number: int, delay:
             time.sleep(0.005)
         time.sleep(delay)
         child.send_signal(number)
-        _, err = child.communicate(timeout=120)
+        _, err = child.communicate(timeout=PATIENCE)
     return child.returncode, err
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from command_line import FIT, TINY, process, rows, simpel, start
+from command_line import FIT, PATIENCE, TINY, process, rows, simpel, start
 
 
 class TestSweep:
@@ -38,7 +38,7 @@ class TestSweep:
         with start(tmp_path, "fit", "-m", *words) as child:
             wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
             os.kill(worker_of(child.pid), signal.SIGKILL)
-            _, err = child.communicate(timeout=240)
+            _, err = child.communicate(timeout=PATIENCE)
         assert child.returncode == 1
         assert "1 of 3 jobs failed" in err
         assert "1: the worker process died (out of memory, or killed)" in err
@@ -50,7 +50,7 @@ class TestSweep:
         with start(tmp_path, "sweep", *words, start_new_session=True) as child:
             wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
             os.killpg(child.pid, signal.SIGINT)  # as a terminal does
-            _, err = child.communicate(timeout=120)
+            _, err = child.communicate(timeout=PATIENCE)
         assert child.returncode == 130
         assert "stopped: the sweep was stopped; finished jobs are kept." in err
         assert "Traceback" not in err
