@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.discovery.coordinates import Coordinates
-from simpel_cli.discovery.filter import MOST_KEPT, Filter, Track, still
+from simpel_cli.discovery.filter import MOST_KEPT, Filter, Track
 from simpel_cli.discovery.setup import Setup
 from simpel_cli.discovery.windows import Windows
 
@@ -133,7 +133,7 @@ def _window(
     spread: Array,
 ) -> tuple[Track, Array, Array]:
     p, noise = Coordinates.of(bounds, layout).physical(z)
-    track = rule.track(still(p), noise, y, ok, u, start, spread)
+    track, _ = rule.track(p, noise, y, ok, u, start, spread)
     u_sub = rule.arriving(p, u)
     rows = y.shape[0]
 

@@ -32,7 +32,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float
 
-from simpel_cli.discovery.filter import Filter, Noise, still
+from simpel_cli.discovery.filter import Filter, Noise
 
 LOG_2PI = float(np.log(2 * np.pi))
 Carry = tuple[Array, Array, Array]
@@ -117,7 +117,7 @@ def forecast(
 
         def run(p: Array) -> tuple[Array, Array, Array, Array]:
             # nothing is measured: what the filter predicts is the model alone, late sensors included
-            track = rule.track(still(p), silent, nothing, nothing, inputs, x, jnp.zeros_like(x))
+            track, _ = rule.track(p, silent, nothing, nothing, inputs, x, jnp.zeros_like(x))
             return -track.innovation, track.predicted, track.jacobian, track.slope
 
         mean, states, jacobian, slope = jax.vmap(jax.vmap(run))(members.p)

@@ -7,10 +7,15 @@ special. The process noise q makes the horizon adapt: a wrong model follows the 
 episodes. R is diagonal, so a row of measurements is taken in one scalar after the other (Bierman 1977): no inverse, and
 a missing one is left out.
 
+Derivatives do without second derivatives inside the integrator. Where a noise moves they are exact. Where a parameter of a
+small model moves, the Jacobian of a row follows to second order in dt. A large model holds its gains then, as the innovations
+form of a prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
+
 All arrays may have trailing axes for many windows and hypotheses at once: the innermost loops then run over contiguous
 numbers.
 
-Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004).
+Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004); Ljung
+(1999), System identification, ch. 7.
 """
 
 from collections import OrderedDict
@@ -22,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from simpel_cli.discovery.augmented import Augmented
-from simpel_cli.discovery.slopes import with_slope
+from simpel_cli.discovery.slopes import movable, with_slope
 from simpel_cli.signals import arriving
 from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
@@ -47,17 +52,30 @@ class Track(NamedTuple):
     slope: Float[Array, "T ny nx ..."]  # of what the sensors read, in the predicted state
 
 
+class Held(NamedTuple):
+    """What stays as it is where a parameter moves, one row per measured row."""
+
+    gain: Float[Array, "T ny nx ..."]  # 0 where a measurement does not count
+    prompt: Float[Array, "T ny nx ..."]  # slope of what the sensors would read, were none late
+    rate_x: Float[Array, "T nx nx ..."]  # slope of the rates in the state, at the end of the row before
+
+
 class Filter(NamedTuple):
     """The filter of one augmented model; every array may have further axes behind those named here.
 
     Args:
-        track: (moving, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`).
+        track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
+        moved: (moving, noise, track, held, y, ok, u, start, spread) -> innovations and variances: to be differentiated in
+            what moves.
+        louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
         flow: (p, x, u of the substeps) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         arriving: (p, u) -> inputs as they arrive, (T, substeps, nu).
     """
 
-    track: Callable[..., Track]
+    track: Callable[..., tuple[Track, Held]]
+    moved: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
+    louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
     arriving: Callable[..., Float[Array, "T substeps nu"]]
@@ -83,6 +101,7 @@ def still(p: Float[Array, "dp ..."]) -> Moving:
     return Moving(p, jnp.full(points, p.shape[0]), jnp.zeros(points, p.dtype))
 
 
+SMALL = 3  # states of a model whose covariance follows the parameters
 _KEPT: OrderedDict[tuple, Filter] = OrderedDict()
 MOST_KEPT = (
     16  # filters; searches of one process that differ in their measurements only share what was traced and compiled
@@ -114,6 +133,8 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
 def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     model = augmented.model
     rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
+    moving_rates, moving_sensors = movable(augmented, 0), movable(augmented, 1)
+    bend = movable(augmented, 0, slope=True)
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
     h = dt / substeps
     periodic = {q.name for q in model.states if q.periodic}
@@ -136,30 +157,46 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         return _over_points(one, p.ndim - 1)(u, *times, *widths)
 
-    def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+    # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
+    stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
+
+    def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return the state one row later, and the rate there."""
+
+        def step(carry: tuple[Array, Array], u: Array) -> tuple[tuple[Array, Array], None]:
+            x, before = carry
+
+            def stage(carry: tuple[Array, Array], weights: Array) -> tuple[tuple[Array, Array], None]:
+                total, slope = carry
+                slope = moving_rates(x + h * weights[0] * slope, u, given)
+                return (total + h * weights[1] * slope, slope), None
+
+            return jax.lax.scan(stage, (x, before), stages)[0], None
+
+        return jax.lax.scan(step, (x, jnp.zeros_like(x)), u)[0]
+
+    def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
 
-        # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
         def stage(carry: Any, weights: Array) -> tuple[Any, None]:
             x, phi, u, total, total_phi, slope, slope_phi, _ = carry
-            slope, rate_x = apart(rates(x + h * weights[0] * slope, u, given))
+            slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
             slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
             after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
             return (x, phi, u, after, after_phi, slope, slope_phi, rate_x), None
 
-        weights = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
         def step(carry: Any, u: Array) -> tuple[Any, None]:
             x, phi, *_ = carry
-            end = jax.lax.scan(stage, (x, phi, u, x, phi, *nothing, nothing[1]), weights)[0]
+            end = jax.lax.scan(stage, (x, phi, u, x, phi, *nothing, nothing[1]), stages)[0]
             return (end[3], end[4], end[5], end[7]), None
 
         return jax.lax.scan(step, (x, unit, *nothing), u)[0]
 
-    def measure(given: Moving, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
-        """Return what the sensors read and its derivative in the state; a late one looks back along the rate.
+    def back(p: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
+        """Return how far late sensors look back along the motion, (ny, nx, ...), and the time, (ny, 1, ...).
 
         A delay d and a lag tau act together as exp(-d s)/(1 + tau s), to second order
 
@@ -168,55 +205,134 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         which holds while d and tau are short against the motion (the next term is about tau^3 times the third
         derivative) and against the time since the input last changed: y' and y'' are those of the substep that just ended.
         """
-        y, slope = sensors(x, u, given)
-        if not (sensor_delays or sensor_lags):
-            return y, slope
-        d, tau = (per_signal(given.p, rows, ny)[:, None] for rows in (sensor_delays, sensor_lags))
+        d, tau = (per_signal(p, rows, ny)[:, None] for rows in (sensor_delays, sensor_lags))
         late, twice = d + tau, 0.5 * d**2 + d * tau + tau**2
-        back = -late * rate[None] + twice * product(rate_x, rate[:, None])[None, :, 0]
-        return y + jnp.sum(slope * back, axis=1), slope - late * product(slope, rate_x)
+        return -late * rate[None] + twice * product(rate_x, rate[:, None])[None, :, 0], late
 
-    def track(given: Moving, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> Track:
-        u_sub = inputs(given.p, u)
-        extra = start.ndim - 1
-        half = along(jnp.eye(nx), extra) * (noise.q**2 * (dt / 2))[None]
+    def seen(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array, Array]:
+        """Return what the sensors read, its derivative in the state, and the latter if no sensor were late."""
+        y, prompt = sensors(x, u, p)
+        if not (sensor_delays or sensor_lags):
+            return y, prompt, prompt
+        shift, late = back(p, rate, rate_x)
+        return y + jnp.sum(prompt * shift, axis=1), prompt - late * product(prompt, rate_x), prompt
 
-        def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, Track]:
+    def wrapped(error: Array) -> Array:
+        """Take a difference of angles the short way round; error: (ny, ...)."""
+        if not any(wraps):
+            return error
+        return jnp.where(along(jnp.array(wraps), error.ndim - 1), jnp.mod(error + jnp.pi, 2 * jnp.pi) - jnp.pi, error)
+
+    def halved(noise: Noise) -> Array:
+        """Half of the process noise of a row: it enters before and after the flow."""
+        return along(jnp.eye(nx), noise.q.ndim - 1) * (noise.q**2 * (dt / 2))[None]
+
+    def after(cov: Array, jacobian: Array, half: Array) -> Array:
+        return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
+
+    def of_start(spread: Array) -> Array:
+        return along(jnp.eye(nx), spread.ndim - 1) * (spread**2)[None]
+
+    def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
+        u_sub, half = inputs(p, u), halved(noise)
+
+        def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, tuple[Track, Held]]:
             x, cov, u_before, rate, rate_x = carry
             y_k, ok_k, u_k = data
             predicted, predicted_cov = x, cov
             # the sensor is read at the row: what arrived up to it is the last substep before
-            h_k, slope = measure(given, x, u_before, rate, rate_x)
+            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x)
+            off = wrapped(y_k - h_k)
+            errors, variances, gains = [], [], []
+            for j in range(ny):
+                c = slope[j]
+                reach = apart(product(cov, c[:, None])[:, 0])
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
+                gain = apart((ok_k[j] / s)[None] * reach)
+                errors.append(e)
+                variances.append(s)
+                gains.append(gain)
+                x = x + gain * e[None]
+                cov = cov - gain[:, None] * reach[None]
+                x, cov = apart((x, cov))
+            following, jacobian, rate_after, rate_x_after = flow_with_slope(p, x, u_k)
+            innovation, variance = jnp.stack(errors), jnp.stack(variances)
+            out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
+            held = Held(jnp.stack(gains), prompt, rate_x)
+            return (following, after(cov, jacobian, half), u_k[-1], rate_after, rate_x_after), (out, held)
+
+        nothing = jnp.zeros_like(start), jnp.zeros((nx, *start.shape), start.dtype)
+        return jax.lax.scan(row, (start, of_start(spread), u_sub[0, 0], *nothing), (y, ok, u_sub))[1]
+
+    def jacobian_of(given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
+        """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
+        slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0], u[-1]), strict=True)), jnp.zeros(()))
+        change = dt / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
+        return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
+
+    def moved(
+        given: Moving, noise: Noise, at: Track, held: Held, y: Array, ok: Array, u: Array, start: Array, spread: Array
+    ) -> tuple[Array, Array]:
+        u_sub, half = inputs(given.p, u), halved(noise)
+
+        def row(carry: tuple[Array, ...], data: tuple[Any, ...]) -> tuple[tuple, tuple[Array, Array]]:
+            x, cov, u_before, rate = carry
+            y_k, ok_k, u_k, at_k, held_k = data
+            read, predicted = moving_sensors(x, u_before, given), x
+            if sensor_delays or sensor_lags:
+                read = read + jnp.sum(held_k.prompt * back(given.p, rate, held_k.rate_x)[0], axis=1)
+            off = wrapped(y_k - read)
+            errors, variances = [], []
+            for j in range(ny):
+                c, gain, s = at_k.slope[j], held_k.gain[j], at_k.variance[j]
+                if nx <= SMALL:
+                    reach = product(cov, c[:, None])[:, 0]
+                    s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                    gain = (ok_k[j] / s)[None] * reach
+                    cov = cov - gain[:, None] * reach[None]
+                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
+                errors.append(e)
+                variances.append(s)
+                x = x + gain * e[None]
+            following, rate = flow(given, x, u_k)
+            if nx <= SMALL:
+                cov = after(cov, jacobian_of(given, at_k.jacobian, (x, following), u_k), half)
+            return (following, cov, u_k[-1], rate), (jnp.stack(errors), jnp.stack(variances))
+
+        begin = (start, of_start(spread), u_sub[0, 0], jnp.zeros_like(start))
+        return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
+
+    def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
+        half = halved(noise)
+
+        def row(carry: tuple[Array, Array], data: tuple[Array, ...]) -> tuple[tuple, tuple[Array, Array]]:
+            away, cov = carry  # away: from the state of `at`
+            e_k, gain, slope, jacobian, ok_k = data
             errors, variances = [], []
             for j in range(ny):
                 c = slope[j]
-                gain = apart(product(cov, c[:, None])[:, 0])
-                s = product(c[None], gain[:, None])[0, 0] + noise.r[j] ** 2
-                e = y_k[j] - h_k[j]
-                e = jnp.mod(e + jnp.pi, 2 * jnp.pi) - jnp.pi if wraps[j] else e
-                e = e - product(c[None], (x - predicted)[:, None])[0, 0]
-                weight, pull = apart((ok_k[j] / s, ok_k[j] * e / s))
+                reach = product(cov, c[:, None])[:, 0]
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                e = e_k[j] - product(c[None], away[:, None])[0, 0]
+                own = (ok_k[j] / s)[None] * reach
                 errors.append(e)
                 variances.append(s)
-                x = x + gain * pull[None]
-                cov = cov - (weight[None] * gain)[:, None] * gain[None]
-                x, cov = apart((x, cov))
-            following, jacobian, rate, rate_x = flow(given, x, u_k)
-            after = product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
-            out = Track(jnp.stack(errors), jnp.stack(variances), predicted, predicted_cov, x, cov, jacobian, slope)
-            return (following, after, u_k[-1], rate, rate_x), out
+                away = away + own * e[None] - gain[j] * e_k[j][None]
+                cov = cov - own[:, None] * reach[None]
+            away = product(jacobian, away[:, None])[:, 0]
+            return (away, after(cov, jacobian, half)), (jnp.stack(errors), jnp.stack(variances))
 
-        nothing = jnp.zeros_like(start), jnp.zeros((nx, *start.shape), start.dtype)
-        begin = (start, along(jnp.eye(nx), extra) * (spread**2)[None], u_sub[0, 0], *nothing)
-        return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
+        data = (at.innovation, held.gain, at.slope, at.jacobian, ok)
+        return jax.lax.scan(row, (jnp.zeros_like(spread), of_start(spread)), data)[1]
 
     def plain_flow(p: Array, x: Array, u: Array) -> Array:
         return flow(still(p), x, u)[0]
 
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
-        return sensors(x, u, still(p))[0]
+        return sensors(x, u, p)[0]
 
-    return Filter(track, plain_flow, plain_measure, inputs)
+    return Filter(track, moved, louder, plain_flow, plain_measure, inputs)
 
 
 def product(a: Float[Array, "n k ..."], b: Float[Array, "k m ..."]) -> Float[Array, "n m ..."]:

@@ -75,7 +75,7 @@ class Course(NamedTuple):
     """Where the fits of a batch of lanes stand; NumPy outside the program, JAX inside; leading axis: lanes."""
 
     z: Any  # (L, n) where they started
-    index: Any  # (L, width) of z that move
+    index: Any  # (L, width) of z that move: every level of noise, in order, then parameters and knobs
     moves: Any  # (L, width) False: padding
     weight: Any  # (L, W)
     trial: Any  # (L, width) the next point to try
@@ -129,19 +129,35 @@ class Fitter:
 
     def _begin(self, lanes: Sequence[Lane]) -> Course:
         padding = len(self.coordinates.low) - 1
+        noise = self._noise
         index = np.full((len(lanes), self.width), padding)
+        index[:, : len(noise)] = noise
+        moves = np.zeros(index.shape, bool)
         for i, lane in enumerate(lanes):
-            if len(lane.free) > self.width:
-                raise ValueError(f"{len(lane.free)} free unknowns, {self.width} at most")
-            index[i, : len(lane.free)] = lane.free
+            columns = self._columns(lane.free)
+            if max(columns, default=0) >= self.width:
+                raise ValueError(f"{len(lane.free)} free unknowns, room for {self.width - len(noise)} beside the noise")
+            index[i, columns] = lane.free
+            moves[i, columns] = True
         z = np.stack([lane.z for lane in lanes])
         part = np.take_along_axis(z, index, axis=1)
         count, width = index.shape
         return Course(
-            z, index, index != padding, np.stack([lane.weight for lane in lanes]), part.copy(), part,
+            z, index, moves, np.stack([lane.weight for lane in lanes]), part.copy(), part,
             np.full(count, np.inf), np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1)),
             np.full(count, FIRST_DAMPING), np.zeros(count, int), np.zeros(count, bool), np.zeros(count, int),
         )  # fmt: skip
+
+    @property
+    def _noise(self) -> range:
+        n_p, n_r, n_q = self.coordinates.sizes
+        return range(n_p, n_p + n_r + n_q)
+
+    def _columns(self, free: Sequence[int]) -> list[int]:
+        """Columns of the program that free unknowns take: a level of noise its own, others the next one."""
+        noise = self._noise
+        others = iter(range(len(noise), len(noise) + len(free)))
+        return [i - noise.start if i in noise else next(others) for i in free]
 
     def _advanced(self, state: Course, most: int, chunk: np.ndarray) -> list[np.ndarray]:
         filled = np.concatenate([chunk, np.repeat(chunk[:1], self.lanes - len(chunk))])
@@ -152,12 +168,12 @@ class Fitter:
 
     def _optimum(self, state: Course, i: int, free: tuple[int, ...]) -> Optimum:
         z = state.z[i].copy()
-        d = len(free)
-        z[list(free)] = state.part[i, :d]
+        columns = self._columns(free)
+        z[list(free)] = state.part[i, columns]
         uniform = ~self.coordinates.normal[list(free)]
         return _optimum(
-            z, free, uniform, float(state.loss[i]), state.gradient[i], state.fisher[i], int(state.iteration[i]),
-            bool(state.done[i]),
+            z, free, uniform, float(state.loss[i]), state.gradient[i][columns], state.fisher[i][np.ix_(columns, columns)],
+            int(state.iteration[i]), bool(state.done[i]),
         )  # fmt: skip
 
 
@@ -172,7 +188,6 @@ def _optimum(
     converged: bool,
 ) -> Optimum:
     d = len(free)
-    gradient, fisher = gradient[:d], fisher[:d, :d]
     if not np.isfinite(loss) or not np.isfinite(fisher).all():
         return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), z[list(free)], np.eye(d), iterations, False)
     values = np.maximum(np.linalg.eigvalsh(fisher), LEAST_CURVATURE)
@@ -222,23 +237,34 @@ def _evaluate(
     tiled = [jnp.tile(a, (1,) * (a.ndim - 1) + (count,)) for a in (y, ok, u, start, spread)]
     z = jax.vmap(lambda z, i, v, m: z.at[i].set(jnp.where(m, v, z[i])))(lanes.z, lanes.index, part, lanes.moves)
 
-    def innovations(z: Array, row: Array) -> tuple[Array, Array]:
-        p, noise = jax.vmap(coordinates.physical, out_axes=-1)(z)
-        value = jnp.take_along_axis(p, jnp.minimum(row, p.shape[0] - 1)[None], axis=0)[0]
-        each = partial(jnp.repeat, repeats=windows, axis=-1)
-        track = rule.track(Moving(each(p), each(row), each(value)), Noise(*map(each, noise)), *tiled)
-        return track.innovation, track.variance
+    each = partial(jnp.repeat, repeats=windows, axis=-1)
+    physical = jax.vmap(coordinates.physical, out_axes=-1)
+    n_p, n_r, n_q = coordinates.sizes
+    p, noise = physical(z)
+    loud = Noise(*map(each, noise))
+    track, held = rule.track(each(p), loud, *tiled)
+    _, ok, _, _, spread = tiled
 
-    def along_one(index: Array) -> Any:
+    def moved(z: Array, row: Array) -> tuple[Array, Array]:
+        p = physical(z)[0]
+        value = jnp.take_along_axis(p, jnp.minimum(row, n_p - 1)[None], axis=0)[0]
+        return rule.moved(Moving(each(p), each(row), each(value)), loud, track, held, *tiled)
+
+    def along_one(index: Array) -> tuple[Array, Array]:
         direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(index)
-        rows = coordinates.sizes[0]
-        row = jnp.where(index < rows, index, rows)  # a noise is no parameter of the model
-        return jax.jvp(lambda z: innovations(z, row), (z,), (direction,))
+        row = jnp.where(index < n_p, index, n_p)  # padding is no parameter of the model
+        return jax.jvp(lambda z: moved(z, row), (z,), (direction,))[1]
 
-    (e, s), (de, ds) = jax.vmap(along_one, in_axes=1, out_axes=((None, None), 0))(lanes.index)
-    ok = tiled[1] > 0
-    s = jnp.where(ok, s, 1.0)
-    e = jnp.where(ok, e, 0.0)
+    def along_noise(direction: Array) -> tuple[Array, Array]:
+        louder = lambda z: rule.louder(Noise(*map(each, physical(z)[1])), track, held, ok, spread)  # noqa: E731
+        return jax.jvp(louder, (z,), (jnp.broadcast_to(direction, z.shape),))[1]
+
+    levels = jnp.zeros((n_r + n_q, z.shape[1])).at[jnp.arange(n_r + n_q), n_p + jnp.arange(n_r + n_q)].set(1.0)
+    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one, in_axes=1)(lanes.index[:, n_r + n_q :])
+    de, ds = (jnp.concatenate(pair) for pair in zip(noises, others, strict=True))
+    ok = ok > 0
+    s = jnp.where(ok, track.variance, 1.0)
+    e = jnp.where(ok, track.innovation, 0.0)
     de, ds = (jnp.where(ok[None], a, 0.0) for a in (de, ds))
     weight = lanes.weight.reshape(-1)
 

@@ -1,6 +1,6 @@
-"""A model's functions with their derivative in the state, and what both do when the state or one parameter moves.
+"""A model's functions with their derivative in the state, and what they do when the state or one parameter moves.
 
-Left to itself, XLA works out every sine anew for every direction of a derivative. Here CasADi differentiates twice, the
+Left to itself, XLA works out every sine anew for every direction of a derivative. Here CasADi differentiates, the
 derivatives are made once per point, and a direction costs a few products with the structural nonzeros.
 """
 
@@ -19,11 +19,13 @@ from simpel_cli.discovery.augmented import Augmented
 if TYPE_CHECKING:
     from simpel_cli.discovery.filter import Moving
 
-Slope = Callable[[Array, Array, "Moving"], tuple[Array, Array]]
+Slope = Callable[[Array, Array, Array], tuple[Array, Array]]
+Value = Callable[[Array, Array, "Moving"], Array]
+NAMES = ["x", "u", "p"]
 
 
 def with_slope(augmented: Augmented, of: int) -> Slope:
-    """Return (x, u, moving) -> one result of the model's function, (n, ...), and its derivative in x, (n, nx, ...).
+    """Return (x, u, p) -> one result of the model's function, (n, ...), and its derivative in x, (n, nx, ...).
 
     Args:
         augmented: model with candidates.
@@ -33,43 +35,56 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
     result = augmented.function(x, u, p)[of]
     n, nx = result.numel(), x.numel()
     values = casadi.densify(casadi.vertcat(result, casadi.vec(casadi.jacobian(result, x).T)))
-    in_x, in_u, in_p = (casadi.jacobian(values, v) for v in (x, u, p))
-    blocks = _blocks(_places(in_p), n, nx)
-    in_p = casadi.vertcat(*(casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks))
-    names = ["x", "u", "p"]
-    ranges = [
-        [(q.low, q.high) for q in group] for group in (augmented.model.states, augmented.model.inputs, augmented.params)
-    ]
-    checked(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]), ranges)
+    model = augmented.model
+    ranges = [[(q.low, q.high) for q in group] for group in (model.states, model.inputs, augmented.params)]
+    both = casadi.Function("both", [x, u, p], casadi.cse([values]), NAMES, ["v"])
+    checked(both, ranges)
     # jit within jit: the lists of instructions are walked once, not in every program that uses them
-    plain = to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([values]), names, ["v"]))
-    slopes = [values, in_x, in_u, in_p]
-    with_all = casadi.Function("slopes", [x, u, p], casadi.cse(slopes), names, ["v", "by_x", "by_u", "by_p"])
-    every = to_jax_rows(with_all)
+    every = jax.jit(to_jax_rows(both))
 
-    @jax.jit
-    def value(x: Array, u: Array, p: Array) -> Array:
-        v = plain(x, u, p)[0]
-        return jnp.concatenate([v[:n], _finite(v[n:])])
+    def at(x: Array, u: Array, p: Array) -> tuple[Array, Array]:
+        v = every(x, u, p)[0]
+        return v[:n], _finite(v[n:]).reshape(n, nx, *v.shape[1:])
+
+    return at
+
+
+def movable(augmented: Augmented, of: int, *, slope: bool = False) -> Value:
+    """Return (x, u, moving) -> one result of the model's function, (n, ...), to be differentiated along a direction.
+
+    Args:
+        augmented: model with candidates.
+        of: 0 for the rates, 1 for the sensors.
+        slope: return its derivative in x instead, row by row, (n nx, ...).
+    """
+    x, u, p = (augmented.function.sx_in(i) for i in range(3))
+    result = augmented.function(x, u, p)[of]
+    result = casadi.densify(casadi.vec(casadi.jacobian(result, x).T) if slope else result)
+    in_x, in_u, in_p = (casadi.jacobian(result, v) for v in (x, u, p))
+    blocks = _blocks(_places(in_p))
+    in_p = casadi.vertcat(*(casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks))
+    plain = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([result]), NAMES, ["v"])))
+    slopes = casadi.cse([result, in_x, in_u, in_p])
+    every = to_jax_rows(casadi.Function("slopes", [x, u, p], slopes, NAMES, ["v", "by_x", "by_u", "by_p"]))
 
     @jax.jit
     def all_of(x: Array, u: Array, p: Array) -> tuple[Array, ...]:
         v, *slopes = every(x, u, p)
-        return jnp.concatenate([v[:n], _finite(v[n:])]), *map(_finite, slopes)
+        return v, *map(_finite, slopes)
 
     places_x, places_u = _places(in_x), _places(in_u)
 
     @jax.custom_jvp
-    def flat(x: Array, u: Array, p: Array, row: Array, moving: Array) -> Array:
-        return value(x, u, p)
+    def value(x: Array, u: Array, p: Array, row: Array, moving: Array) -> Array:
+        return plain(x, u, p)[0]
 
-    @flat.defjvp
+    @value.defjvp
     def _(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, u, p, row, _ = primals
         tx, tu, _, _, moved_by = tangents
         # without the barrier XLA fuses the expressions into every direction, and works them out again for each
         v, by_x, by_u, by_p = jax.lax.optimization_barrier(all_of(x, u, p))
-        sums: list[Any] = [0.0] * len(values.nonzeros())
+        sums: list[Any] = [0.0] * v.shape[0]
         for places, slope, tangent in ((places_x, by_x, tx), (places_u, by_u, tu)):
             for k, (i, j) in enumerate(places):
                 sums[i] = sums[i] + slope[k] * tangent[j]
@@ -87,11 +102,7 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
                 sums[i] = sums[i] + column[k] * step
         return v, jnp.stack([jnp.broadcast_to(s, v.shape[1:]) for s in sums])
 
-    def point(x: Array, u: Array, given: "Moving") -> tuple[Array, Array]:
-        v = flat(x, u, jax.lax.stop_gradient(given.p), given.row, given.value)
-        return v[:n], v[n:].reshape(n, nx, *v.shape[1:])
-
-    return point
+    return lambda x, u, given: value(x, u, jax.lax.stop_gradient(given.p), given.row, given.value)
 
 
 def _finite(slopes: Array) -> Array:
@@ -100,22 +111,21 @@ def _finite(slopes: Array) -> Array:
 
 
 class _Block(NamedTuple):
-    """Parameters that act on the same results, and the rows of values and slopes that any of them changes."""
+    """Parameters that act on the same results."""
 
     rows: list[int]
     columns: list[int]
 
 
-def _blocks(places: list[tuple[int, int]], n: int, nx: int) -> list[_Block]:
+def _blocks(places: list[tuple[int, int]]) -> list[_Block]:
     """Gather parameters by the results that they act on: most act on one, and all other rows would be zeros."""
     rows_of: dict[int, set[int]] = {}
     for i, j in places:
         rows_of.setdefault(j, set()).add(i)
     groups: dict[frozenset[int], list[int]] = {}
     for j, rows in sorted(rows_of.items()):
-        results = frozenset(i if i < n else (i - n) // nx for i in rows)
-        groups.setdefault(results, []).append(j)
-    return [_Block(sorted(set().union(*(rows_of[j] for j in group))), group) for group in groups.values()]
+        groups.setdefault(frozenset(rows), []).append(j)
+    return [_Block(sorted(rows), columns) for rows, columns in groups.items()]
 
 
 def _places(matrix: casadi.SX) -> list[tuple[int, int]]:
