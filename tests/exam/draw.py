@@ -19,6 +19,7 @@ from tests.exam.planted import (
     by_key,
 )
 from tests.exam.plants import SYSTEMS
+from tests.exam.twins import apart
 
 FULL, POSITION, CLOSED, SHAKEN = "full", "position only", "closed loop", "process noise"
 OUTLIERS, QUANTISED, DERIVED = "outliers", "quantised", "derived velocity"
@@ -98,6 +99,8 @@ def possible(system: str, condition: str, effects: tuple[Effect, ...]) -> bool:
     if condition == DERIVED:
         return bool(told.velocity) and not any(e.both for e in effects)
     if condition == POSITION:
+        if not apart(system, tuple(e.key for e in effects), position_only=True):
+            return False
         return not any(e.both or (e.kind == SENSOR and e.acts_on not in told.position) for e in effects)
     return condition != CLOSED or not any(e.kind in (LATE_SENSOR, SLOW_SENSOR) for e in effects)
 
@@ -111,7 +114,10 @@ def _planted(random: np.random.Generator, system: str, kind: str) -> tuple[Effec
         of_rate = [e for e in effects if e.group == ONE and e.kind == RATE and e.name != "added_inertia"]
         of_input = [e for e in effects if e.group == ONE and e.kind not in (RATE, OWN_RATE, SENSOR) and not e.both]
         of_input += [e for e in effects if e.group == ONE and e.kind == INPUT and e.name == "input_dead_zone"]
-        return of_rate[random.integers(len(of_rate))], of_input[random.integers(len(of_input))]
+        while True:
+            pair = of_rate[random.integers(len(of_rate))], of_input[random.integers(len(of_input))]
+            if apart(system, tuple(e.key for e in pair), position_only=False):
+                return pair
     pool = [e for e in effects if e.group == kind]
     names = sorted({e.name for e in pool})
     name = names[random.integers(len(names))]

@@ -1,4 +1,6 @@
-"""Effects that no data of a rig can tell apart, since its parameters take up the difference."""
+"""Effects that no data of a rig can tell apart, since its parameters or another effect's take up the difference."""
+
+from itertools import permutations
 
 _LEVEL: dict[str, tuple[frozenset[str], ...]] = {
     "pendulum": (
@@ -27,6 +29,13 @@ _ONE_SENSOR: dict[str, tuple[frozenset[str], ...]] = {
         frozenset({"input_delay@u", "sensor_delay@T_2"}),
     ),
 }
+_HOLDS = {  # an effect -> another that its own parameters make up for, where both are there
+    "pendulum": {"asymmetric_friction@omega": "constant_load@omega"},
+    "cart": {"asymmetric_friction@v": "constant_load@v"},
+    "car": {"asymmetric_friction@v": "constant_load@v"},
+}
+_ONE_SENSOR_HOLDS = {"thermal": {"crowding@T_1": "input_offset@u"}}
+_ONE_SENSOR_ABSORBED = {"thermal": {"thermal_coupling@T_1"}}  # two poles and a gain: as many as the rig has parameters
 
 
 def twins(system: str, key: str, *, position_only: bool) -> list[str]:
@@ -38,3 +47,20 @@ def twins(system: str, key: str, *, position_only: bool) -> list[str]:
     """
     groups = _LEVEL[system] + (_ONE_SENSOR.get(system, ()) if position_only else ())
     return sorted({other for group in groups if key in group for other in group} - {key})
+
+
+def apart(system: str, keys: tuple[str, ...], *, position_only: bool) -> bool:
+    """Whether data can show each of several planted effects `name@place` beside the others.
+
+    Not so for twins, nor for an effect that holds the other or a twin of it: friction that differs between the directions is
+    Coulomb's and a constant load. Where only the end of a linear chain is measured, its parameters take in more.
+    """
+    holds = _HOLDS.get(system, {}) | (_ONE_SENSOR_HOLDS.get(system, {}) if position_only else {})
+    if position_only and len(keys) > 1 and _ONE_SENSOR_ABSORBED.get(system, set()) & set(keys):
+        return False
+
+    def made_up(key: str) -> set[str]:
+        held = {holds[key]} if key in holds else set()
+        return held.union(*(twins(system, k, position_only=position_only) for k in (key, *held)))
+
+    return not any(b in made_up(a) for a, b in permutations(keys, 2))

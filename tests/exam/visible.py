@@ -16,13 +16,15 @@ WINDOW = 15  # rows: short enough for first order
 STEP = 1e-4  # of a range or of a state's standard deviation
 
 
-def visible(drawn: Set, made: Record) -> float:
+def visible(drawn: Set, made: Record, only: int | None = None) -> float:
     """Return the nats that the planted terms are worth in the training episodes.
 
     Args:
-        drawn: a set with terms in rates only.
+        drawn: a set with terms in rates and inputs only.
         made: its data.
+        only: number of one planted term, where the others are in the model and their parameters free.
     """
+    beside = [] if only is None else [i for i in range(len(drawn.effects)) if i != only]
     system = SYSTEMS[drawn.system]
     begins = np.arange(0, ROWS, WINDOW)
     start = made.true[:TRAIN, begins].reshape(-1, len(system.states))
@@ -31,8 +33,11 @@ def visible(drawn: Set, made: Record) -> float:
     of_window = np.tile(begins * system.dt, TRAIN)
     columns = [system.states.index(name) for name in drawn.measured]
 
-    def run(x: np.ndarray, p: dict[str, float], *, lacking: bool) -> np.ndarray:
-        rate = plant(system, p, () if lacking else drawn.effects, () if lacking else made.knobs)
+    def run(
+        x: np.ndarray, p: dict[str, float], *, lacking: bool, all_knobs: tuple[dict[str, float], ...] = made.knobs
+    ) -> np.ndarray:
+        there = beside if lacking else range(len(drawn.effects))
+        rate = plant(system, p, tuple(drawn.effects[i] for i in there), tuple(all_knobs[i] for i in there))
         states, _, _ = simulate(lambda s, u, t: rate(s, u, t + of_window), x, commands, system.dt)
         return states[..., columns] / made.noise[columns]
 
@@ -46,6 +51,12 @@ def visible(drawn: Set, made: Record) -> float:
     for name, (low, high) in system.ranges.items():
         moved = made.parameters | {name: made.parameters[name] + STEP * (high - low)}
         by_parameter.append((run(start, moved, lacking=True) - without) / STEP)
+    for i in beside:
+        for name in (n for n in made.knobs[i] if not n.startswith("_")):
+            knobs = [dict(k) for k in made.knobs]
+            knobs[i][name] *= 1 + STEP
+            moved_term = run(start, made.parameters, lacking=True, all_knobs=tuple(knobs))
+            by_parameter.append((moved_term - without) / STEP)
     left, rest = [], []
     for w in range(len(start)):  # first states are each window's own
         own = np.stack([s[w].ravel() for s in by_start], -1)
