@@ -14,14 +14,15 @@ from command_line import CACHE
 from scipy.linalg import expm
 
 from simulators.model import Declared
-from tests.exam import mujoco_plants, rivals, score, table, tool
-from tests.exam.draw import CLOSED, FULL, NONE, ONE, SHARE_OF_CONDITION, Set, draw, possible
+from tests.exam import __main__ as main
+from tests.exam import campaign, mujoco_plants, rivals, score, table, tool
+from tests.exam.draw import CLOSED, FULL, NONE, ONE, POSITION, SHARE_OF_CONDITION, TWO, Set, draw, possible
 from tests.exam.examine import places
 from tests.exam.integrate import simulate
 from tests.exam.planted import ABSORBED, EFFECTS, LATE_SENSOR, by_key
 from tests.exam.plants import SYSTEMS
 from tests.exam.record import plant, record
-from tests.exam.twins import twins
+from tests.exam.twins import apart, twins
 from tests.exam.visible import visible
 from tests.exam.write import write
 
@@ -234,6 +235,51 @@ def test_draws_keep_the_shares() -> None:
     assert len(named) >= 25
 
 
+@pytest.mark.parametrize(
+    ("system", "planted", "condition"),
+    [
+        ("pendulum", ("constant_load@omega", "input_offset@u"), FULL),
+        ("pendulum", ("asymmetric_friction@omega", "input_offset@u"), FULL),
+        ("cart", ("constant_load@v", "input_offset@u"), POSITION),
+        ("car", ("constant_load@v", "input_offset@throttle"), FULL),
+        ("thermal", ("constant_inflow@T_1", "input_offset@u"), FULL),
+        ("thermal", ("constant_inflow@T_2", "input_offset@u"), POSITION),
+        ("thermal", ("crowding@T_1", "input_offset@u"), POSITION),
+        ("pendulum", ("coulomb_friction@omega", "input_offset@u"), FULL),
+        ("cart", ("coulomb_friction@v", "input_offset@u"), FULL),
+        ("car", ("coulomb_friction@v", "input_offset@throttle"), FULL),
+        ("thermal", ("crowding@T_1", "input_offset@u"), FULL),
+    ],
+)
+def test_two_effects_are_planted_where_each_can_be_seen_beside_the_other(
+    system: str, planted: tuple[str, ...], condition: str
+) -> None:
+    drawn = one(system, planted[0], strength=0.05, condition=condition)._replace(
+        kind=TWO, planted=planted, strength=(0.05, 0.05)
+    )
+    made = record(drawn)
+    beside = min(visible(drawn, made, i) for i in (0, 1))
+    alone = [one(system, key, strength=0.05, condition=condition) for key in planted]
+    if apart(system, planted, position_only=condition == POSITION):
+        assert beside > 1
+    else:
+        assert beside < 1e-3 * min(visible(d, record(d)) for d in alone)
+
+
+def test_one_sensor_at_the_end_of_a_linear_chain_sees_no_further_coupling() -> None:
+    worth = {
+        c: visible(d, record(d)) for c in (FULL, POSITION) if (d := one("thermal", "thermal_coupling@T_1", condition=c))
+    }
+    assert worth[FULL] > 100
+    assert worth[POSITION] < 1e-2 * worth[FULL]
+
+
+def test_no_two_effects_are_drawn_that_make_up_for_each_other() -> None:
+    pairs = [d for d in (draw(i, 9) for i in range(3000)) if d.kind == TWO]
+    assert {POSITION, FULL} < {d.condition for d in pairs}
+    assert all(apart(d.system, d.planted, position_only=d.condition == POSITION) for d in pairs)
+
+
 def verdict(*effects: dict[str, Any], kind: str = "effect", remainder: Any = None) -> dict[str, Any]:
     return {"verdict": kind, "effects": list(effects), "remainder": remainder}
 
@@ -326,7 +372,8 @@ def test_the_table_has_every_bar_and_tells_what_is_missed() -> None:
     rows = [
         {
             "index": i, "system": "cart", "kind": ("one", "none")[i % 2], "condition": "full", "noise": 0.01, "world": "own",
-            "planted": "", "outcome": ("right", "right", "wrong", "false effect")[i % 4], "names": "", "evidence": 50.0,
+            "strength": (0.5, 0.1)[i % 8 // 4], "memory_mb": 100.0 + i, "planted": "",
+            "outcome": ("right", "right", "wrong", "false effect")[i % 4], "names": "", "evidence": 50.0,
             "bic": "wrong", "of_oracle": 1.0, "of_before": 1.0, "covered": 9, "intervals": 10, "seconds": 3.0,
             "candidates": 20, "message": "",
         }
@@ -338,22 +385,47 @@ def test_the_table_has_every_bar_and_tells_what_is_missed() -> None:
     assert "10/20 = 50.0 % (27..73)" in exact
     assert "not installed" in exact
     assert exact.endswith("NO |")
+    assert "5/10" in lines["planted effect named exactly, noise <= 1 %, default strengths (upper half decade)"]
+    assert "10/20" in lines["- named exactly at 1 % noise, oracle >= 10 nats"]
+    assert "no sets" in lines["- named exactly at 3 % noise, oracle >= 10 nats"]
+    assert ">= 45.0 % (full - 5)" in lines["- exact or tie, oracle >= 10 nats: position only"]
+    assert "3.0 s (nine in ten below 3.0 s, 20 candidates)" in lines["seconds of a search, 2 states, median"]
+    assert any(line.startswith("| cart | 2 | 40 | 3 | 3 |") and line.endswith(" 139 |") for line in text.splitlines())
     assert "10/20" in lines["effect claimed on data with none"]
     assert lines["intervals of parameters and effects that cover (claimed: 90 %)"].endswith("yes |")
     assert "no sets" in lines["two effects, both named, oracle >= 10 nats each"]
     assert all(bar.figure in lines for bar in table.BARS)
 
 
-def test_the_forward_search_names_what_a_regression_can_see(tmp_path: Path) -> None:
+@pytest.mark.parametrize("condition", [FULL, POSITION])
+def test_the_rivals_name_what_a_regression_can_see(condition: str, tmp_path: Path) -> None:
     folder, file = places(tmp_path, 0)
-    write(one("pendulum", "viscous_friction@omega", noise=1e-4), folder, file)
+    write(one("pendulum", "viscous_friction@omega", noise=1e-4, condition=condition), folder, file)
     truth = json.loads(file.read_text())
     made = rivals.problem(folder, "pendulum", truth["measured"])
-    assert ("viscous_friction", "omega") in rivals.forward(made)
     target, columns, more = made["omega"]
     added = next(c.values for c in more if c.effect == "viscous_friction")
     fit = np.linalg.lstsq(np.column_stack([columns, added]), target, rcond=None)[0]
     assert fit[-1] == pytest.approx(-truth["effects"][0]["parameters"]["b"], rel=0.05)
+    assert ("viscous_friction", "omega") in rivals.forward(made)
+    if not rivals.installed():
+        return
+    for size in (rivals.WHOLE, rivals.LEFT):
+        assert rivals.sparse(made, 0.1, size) == [("viscous_friction", "omega")]
+        assert rivals.sparse(made, 10.0, size) == []
+
+
+@pytest.mark.parametrize(("key", "at"), [("input_dead_zone@u", 0.2), ("cogging@omega", 4)])
+def test_of_the_columns_of_an_effect_those_that_fit_best_are_kept(key: str, at: float, tmp_path: Path) -> None:
+    folder, file = places(tmp_path, 0)
+    write(one("pendulum", key, strength=0.6, noise=1e-4), folder, file)
+    target, columns, more = rivals.problem(folder, "pendulum", ["phi", "omega"])["omega"]
+    whole = np.stack([c.values for c in more], -1)
+    left, aim = (a - columns @ np.linalg.lstsq(columns, a, rcond=None)[0] for a in (whole, target))
+    kept = [more[i] for i in rivals._one_shape_each(more, whole, left, aim)]
+    assert {c.at for c in kept if c.effect == key.split("@")[0]} == {at}
+    assert len([c for c in kept if c.effect == "cogging"]) == 2
+    assert len({(c.effect, c.acts_on) for c in kept}) == len(kept) - 1
 
 
 def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -372,6 +444,27 @@ def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytes
     assert tool.discover(folder, "run", few).wall != answer.wall  # what was run is not run again
     (folder / "sim" / "rig.yaml").write_text("_target_: simulators.model.Declared\nname: broken\n")
     assert "ConfigError" in tool.discover(folder, "other").error
+
+
+def test_runs_on_one_folder_share_the_systems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[tuple[str, str]] = []
+
+    def fake(waiting: list[Set], out: Path, tuned: Any, workers: int) -> None:
+        for drawn in waiting:
+            ran.append((drawn.system, str(drawn.index)))
+            campaign.keep(out, campaign.lost(drawn, out, "not run"))
+
+    monkeypatch.setattr(main, "run", fake)
+    monkeypatch.setattr(main, "tuned", lambda: {"cart 0.01": (0.1, "left")})
+    command = ["exam", "--sets", "12", "--seed", "4", "--out", str(tmp_path)]
+    for only in (["cart"], ["pendulum", "cart"], []):
+        monkeypatch.setattr("sys.argv", [*command, *(["--only", *only] if only else [])])
+        main.main()
+    systems = [system for system, _ in ran]
+    assert len(set(ran)) == len(ran) == 12
+    assert systems == sorted(systems, key=lambda s: (s != "cart", s != "pendulum"))
+    assert len(pd.read_parquet(tmp_path / "scores.parquet")) == 12
+    assert json.loads((tmp_path / "exam.json").read_text())["tuned"] == {"cart 0.01": [0.1, "left"]}
 
 
 def test_plays_and_slow_sensors_agree_with_their_definitions() -> None:

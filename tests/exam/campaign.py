@@ -2,6 +2,8 @@
 
 import json
 import multiprocessing
+import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -19,7 +21,7 @@ def neighbours(drawn: Set) -> tuple[int, str, tuple[str, ...], int]:
     return len(SYSTEMS[drawn.system].states), drawn.system, drawn.measured, drawn.index
 
 
-def run(waiting: list[Set], out: Path, thresholds: dict[str, float], workers: int) -> None:
+def run(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], workers: int) -> None:
     """Examine sets in few processes; one that dies takes the sets with it that it was at, and no others."""
     while waiting:
         context = multiprocessing.get_context("spawn")
@@ -27,7 +29,7 @@ def run(waiting: list[Set], out: Path, thresholds: dict[str, float], workers: in
         for mark in begun.values():  # of an exam that was interrupted
             mark.unlink(missing_ok=True)
         with ProcessPoolExecutor(workers, context, max_tasks_per_child=SETS_PER_PROCESS) as pool:
-            futures = {pool.submit(one, d, out, thresholds): d for d in waiting}
+            futures = {pool.submit(one, d, out, tuned): d for d in waiting}
             for future in as_completed(futures):
                 try:
                     told(future.result())
@@ -44,12 +46,12 @@ def run(waiting: list[Set], out: Path, thresholds: dict[str, float], workers: in
         waiting = [d for d in left if d not in died]
 
 
-def one(drawn: Set, out: Path, thresholds: dict[str, float]) -> dict[str, Any]:
+def one(drawn: Set, out: Path, tuned: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
     """Examine one set and keep its score."""
     mark = out / "begun" / str(drawn.index)
     mark.parent.mkdir(exist_ok=True)
     mark.touch()
-    row = examine(drawn, out, thresholds)
+    row = examine(drawn, out, tuned)
     keep(out, row)
     mark.unlink()
     return row
@@ -66,8 +68,15 @@ def lost(drawn: Set, out: Path, message: str) -> dict[str, Any]:
 
 def keep(out: Path, row: dict[str, Any]) -> None:
     """Write the score of a set."""
-    score_file(out, row["index"]).parent.mkdir(exist_ok=True)
-    score_file(out, row["index"]).write_text(json.dumps(row))
+    put(score_file(out, row["index"]), row)
+
+
+def put(path: Path, content: Any) -> None:
+    """Write JSON in one step, since others may read it meanwhile."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_suffix(f".{os.getpid()}")
+    new.write_text(json.dumps(content))
+    new.replace(path)
 
 
 def score_file(out: Path, index: int) -> Path:

@@ -1,6 +1,9 @@
 """One set from its draw to its row of the table of scores."""
 
 import json
+import resource
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from tests.exam.write import write
 RUN, ORACLE = "run", "oracle"
 
 
-def examine(drawn: Set, out: Path, thresholds: dict[str, float] | None = None) -> dict[str, Any]:
+def examine(drawn: Set, out: Path, tuned: Mapping[str, Sequence[Any]] | None = None) -> dict[str, Any]:
     """Write the files of a set, have it searched, and score the answer; what was done before is not done again."""
     folder, file = places(out, drawn.index)
     if not file.exists() or not (folder / "data" / "run.parquet").exists():
@@ -25,9 +28,9 @@ def examine(drawn: Set, out: Path, thresholds: dict[str, float] | None = None) -
     row = {n: truth[n] for n in ("index", "system", "kind", "noise", "condition", "world")} | {
         "planted": "+".join(f"{e['name']}@{e['acts_on']}" for e in truth["effects"] + truth["absorbed"]),
         "strength": min((e["strength"] for e in truth["effects"]), default=0.0),
-        "wall": answer.wall, "message": answer.error,
+        "wall": answer.wall, "memory_mb": _memory(), "message": answer.error,
     }  # fmt: skip
-    row |= rivals(folder, truth, thresholds or {})
+    row |= rivals(folder, truth, tuned or {})
     if answer.error:
         return row | {"outcome": score.ERROR}
     return row | _scored(truth, folder)
@@ -36,6 +39,12 @@ def examine(drawn: Set, out: Path, thresholds: dict[str, float] | None = None) -
 def places(out: Path, index: int) -> tuple[Path, Path]:
     """Return the folder of a set and the file of its truth."""
     return out / "sets" / str(index), out / "truth" / f"{index}.json"
+
+
+def _memory() -> float:
+    """Most memory that this process has had so far, MB: of all the sets that it has searched."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _scored(truth: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -22,11 +22,15 @@ Signals = Mapping[str, np.ndarray]
 
 
 class Column(NamedTuple):
-    """One candidate regressor: the effect that it stands for, where that acts, and its values."""
+    """One candidate regressor: the effect that it stands for, where that acts, and its values.
+
+    Where the effect has a parameter of its own, `at` is its value on the grid; columns with one `at` belong together.
+    """
 
     effect: str
     acts_on: str
     values: np.ndarray
+    at: float = 0.0
 
 
 def known(system: str, x: Signals) -> dict[str, np.ndarray]:
@@ -61,15 +65,15 @@ def candidates(system: str, x: Signals) -> dict[str, list[Column]]:
     for place in known(system, x):
         if system in ("tanks", "thermal"):
             other = next(n for n in told.states if n != place)
-            found[place] = [Column(n, place, c) for n, c in _first_order(x[place], x[other])]
+            found[place] = [Column(n, place, c, at) for n, at, c in _first_order(x[place], x[other])]
             driven = ("u",) if place == told.states[0] else ()
         else:
             rows = _velocity(x[place], x.get(told.velocity.get(place, "")), angle=system == "pendulum")
-            found[place] = [] if place == "theta" else [Column(n, place, c) for n, c in rows]
+            found[place] = [] if place == "theta" else [Column(n, place, c, at) for n, at, c in rows]
             driven = inputs.get(place, ("u",))
         gain = x["v"] if place == "theta" else np.ones_like(x[place])
         for name in driven:
-            found[place] += [Column(n, name, gain * c) for n, c in _input(x[name])]
+            found[place] += [Column(n, name, gain * c, at) for n, at, c in _input(x[name])]
         if system == "cart":  # the rig has a spring and a damper of its own
             found[place] = [c for c in found[place] if c.effect not in ("viscous_friction", "linear_stiffness")]
         if system == "car":
@@ -85,55 +89,55 @@ def merged(names: set[str]) -> set[str]:
     return names
 
 
-def _velocity(v: np.ndarray, s: np.ndarray | None, *, angle: bool) -> Iterator[tuple[str, np.ndarray]]:
+def _velocity(v: np.ndarray, s: np.ndarray | None, *, angle: bool) -> Iterator[tuple[str, float, np.ndarray]]:
     largest = np.abs(v).max()
     side = np.tanh(v / (0.02 * largest))
-    yield "viscous_friction", v
-    yield "coulomb_friction", side
-    yield "stribeck_friction", side * np.exp(-((v / (0.2 * largest)) ** 2))
-    yield "asymmetric_friction", np.abs(side)
-    yield "quadratic_drag", v * np.abs(v)
-    yield "constant_load", np.ones_like(v)
+    yield "viscous_friction", 0.0, v
+    yield "coulomb_friction", 0.0, side
+    yield "stribeck_friction", 0.0, side * np.exp(-((v / (0.2 * largest)) ** 2))
+    yield "asymmetric_friction", 0.0, np.abs(side)
+    yield "quadratic_drag", 0.0, v * np.abs(v)
+    yield "constant_load", 0.0, np.ones_like(v)
     if s is None:
         return
-    yield "linear_stiffness", s
-    yield "cubic_stiffness", s**3
+    yield "linear_stiffness", 0.0, s
+    yield "cubic_stiffness", 0.0, s**3
     for share in (0.8, 0.6):
-        yield "end_stop", s - np.clip(s, -share * np.abs(s).max(), share * np.abs(s).max())
+        yield "end_stop", share, s - np.clip(s, -share * np.abs(s).max(), share * np.abs(s).max())
     if angle:
-        yield "gravity_tilt", np.cos(s)
+        yield "gravity_tilt", 0.0, np.cos(s)
         for n in (2, 3, 4, 6, 8):
-            yield "cogging", np.sin(n * s)
-            yield "cogging", np.cos(n * s)
+            yield "cogging", n, np.sin(n * s)
+            yield "cogging", n, np.cos(n * s)
 
 
-def _first_order(x: np.ndarray, other: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    yield "leak", x
-    yield "outflow_exponent", np.maximum(x, 0.0) ** 1.5
-    yield "crowding", x**2
-    yield "constant_inflow", np.ones_like(x)
-    yield "thermal_coupling", other - x
+def _first_order(x: np.ndarray, other: np.ndarray) -> Iterator[tuple[str, float, np.ndarray]]:
+    yield "leak", 0.0, x
+    yield "outflow_exponent", 0.0, np.maximum(x, 0.0) ** 1.5
+    yield "crowding", 0.0, x**2
+    yield "constant_inflow", 0.0, np.ones_like(x)
+    yield "thermal_coupling", 0.0, other - x
     for share in (0.9, 0.7):
-        yield "overflow", np.maximum(x - share * x.max(), 0.0)
+        yield "overflow", share, np.maximum(x - share * x.max(), 0.0)
 
 
-def _input(u: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+def _input(u: np.ndarray) -> Iterator[tuple[str, float, np.ndarray]]:
     largest = np.abs(u).max()
 
     def earlier(rows: int) -> np.ndarray:
         return np.concatenate([np.repeat(u[:, :1], rows, axis=1), u[:, : u.shape[1] - rows]], axis=1)
 
-    yield "quadratic_input", u * np.abs(u)
+    yield "quadratic_input", 0.0, u * np.abs(u)
     if u.min() < 0:
-        yield "input_gain_asymmetry", np.abs(u)
+        yield "input_gain_asymmetry", 0.0, np.abs(u)
     for share in (0.1, 0.2, 0.3):
-        yield "input_dead_zone", u - np.clip(u, -share * largest, share * largest)
+        yield "input_dead_zone", share, u - np.clip(u, -share * largest, share * largest)
     for share in (0.8, 0.5):
-        yield "input_saturation", np.clip(u, -share * largest, share * largest)
+        yield "input_saturation", share, np.clip(u, -share * largest, share * largest)
     for rows in (1, 2):
-        yield "input_delay", earlier(rows)
+        yield "input_delay", rows, earlier(rows)
     for rows in (1.0, 3.0):
         slow, decay = u.copy(), np.exp(-1 / rows)
         for k in range(1, u.shape[1]):
             slow[:, k] = decay * slow[:, k - 1] + (1 - decay) * u[:, k - 1]
-        yield "input_lag", slow
+        yield "input_lag", rows, slow
