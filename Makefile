@@ -5,8 +5,11 @@ BIN := $(VENV)/bin
 UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
 PYTHON ?= python3
 STAMP := $(VENV)/.installed
+RIVALS := $(VENV)/.rivals
 WORKERS ?= 2
 SETS ?= 600
+SEED ?= 1
+OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
 # worlds whose effects no YAML of conf/ names
 EXAM := --config-dir tests/exam
 
@@ -46,8 +49,12 @@ format: install ## Format the code
 bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
 
-exam: install ## Give `simpel discover` the blind exam (SETS=600; PySINDy beside it after: uv sync --group exam)
-	$(BIN)/python -m tests.exam --sets $(SETS) --out runs/exam/$$(date +%Y%m%d-%H%M%S)
+exam: $(RIVALS) ## Give `simpel discover` and PySINDy the blind exam (SETS=600 SEED=1, OUT=DIR to go on, ONLY="cart car")
+	$(BIN)/python -m tests.exam --sets $(SETS) --seed $(SEED) --out $(OUT) $(if $(ONLY),--only $(ONLY))
+
+$(RIVALS): $(STAMP)
+	UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never $(UV) sync --group exam --frozen --quiet --python $(PYTHON)
+	@touch $@
 
 real: install ## Search the recordings for what their simulators lack (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.real --out runs/real/$$(date +%Y%m%d-%H%M%S)
