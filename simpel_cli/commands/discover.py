@@ -21,6 +21,7 @@ from simpel_cli.discovery.corrected import corrected
 from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.interactions import interaction
 from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
 from simpel_cli.discovery.residual import Forces
@@ -97,6 +98,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     recording = recording._replace(checks=(*recording.checks, outliers))
     selection = search.run(base)
     selection, gates = _gated(search, assessor, selection, terminal)
+    selection = _of_two(search, assessor, selection, attach, options, terminal)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,
@@ -189,12 +191,7 @@ def _gated(
         judged = gate(search, assessor, before, after)
         gates.append(judged)
         added = [search.terms[t].label for t in after.terms if t not in before.terms]
-        why = "the errors ahead grow" if judged.harm else "not certain"
-        terminal.line(
-            f"{' and '.join(added)}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
-            f" by {judged.unit}{'' if judged.passed else f', {why}: not accepted'}",
-            "gate",
-        )
+        _told(" and ".join(added), judged, terminal)
         if not judged.passed:
             kept = before.terms
             order = [selection.chosen.terms.index(t) for t in kept if t in selection.chosen.terms]
@@ -205,3 +202,31 @@ def _gated(
                 gains=tuple(selection.gains[j] for j in order),
             ), gates[:i]
     return selection, gates
+
+
+def _of_two(
+    search: Search,
+    assessor: Assessor,
+    selection: Selection,
+    attach: Callable[..., Setup],
+    options: Discovery,
+    terminal: Terminal,
+) -> Selection:
+    """Where nothing was left, look once more whether what remains is a function of two arguments."""
+    if selection.remainder is not None:
+        return selection
+    told = lambda text: terminal.line(text, "search")  # noqa: E731
+    found = interaction(search, assessor, selection.chosen, attach, options.lanes, told)
+    if found is None:
+        return selection
+    _told(f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}", found.gate, terminal)
+    return selection._replace(remainder=(found.term, found.gain)) if found.gate.passed else selection
+
+
+def _told(what: str, judged: Gate, terminal: Terminal) -> None:
+    why = "the errors ahead grow" if judged.harm else "not certain"
+    terminal.line(
+        f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
+        f" by {judged.unit}{'' if judged.passed else f', {why}: not accepted'}",
+        "gate",
+    )

@@ -46,6 +46,7 @@ def setup(
     *,
     pairs: bool = False,
     kept: Collection[Key] | None = None,
+    extra: Sequence[Term] = (),
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -57,6 +58,7 @@ def setup(
         substeps: Runge-Kutta steps per row; None: as many as the noise asks for.
         pairs: offer functions of two arguments.
         kept: terms to attach; None: all.
+        extra: terms to attach beside them.
 
     Raises:
         DataError: too few rows.
@@ -74,7 +76,8 @@ def setup(
     measured = measured_of(model, recording)
     scales = scales_of(model, recording.train, measured, recording.outputs)
     every = terms_of(model, recording, effects, pairs=pairs)
-    terms = [t for t in every if kept is None or key_of(t) in kept]
+    added = {key_of(t) for t in extra}
+    terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)] + list(extra)
     augmented = augment(model, terms, measured)
     # of all of them, so that windows do not depend on what is kept
     longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)

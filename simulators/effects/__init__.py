@@ -3,6 +3,6 @@
 from simulators.effects.expression import Expression, Scales
 from simulators.effects.structure import Structure, structure
 from simulators.effects.term import Knob, Term
-from simulators.effects.unnamed import unnamed
+from simulators.effects.unnamed import functions_of_two, unnamed
 
-__all__ = ["Expression", "Knob", "Scales", "Structure", "Term", "structure", "unnamed"]
+__all__ = ["Expression", "Knob", "Scales", "Structure", "Term", "functions_of_two", "structure", "unnamed"]

@@ -47,22 +47,25 @@ def unnamed(model: Model, scales: Scales, *, pairs: bool = False) -> list[Term]:
             meaning = f"some function of {argument}"
             constants = () if turns else (size,)
             terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,), constants=constants))
-        if pairs:
-            terms += _pairs(name, per(units[name], "s"), model, scales)
+    if pairs and len(arguments) <= MOST_ARGUMENTS:
+        terms += functions_of_two(model, scales)
     return terms
 
 
-def _pairs(name: str, unit: str, model: Model, scales: Scales) -> list[Term]:
-    """Return one function of every two arguments of which a state is one."""
+def functions_of_two(model: Model, scales: Scales, bases: int = PAIR_BASES) -> list[Term]:
+    """Return one function of every two arguments of which a state is one, for every rate; `bases` waves per argument."""
+    units = {q.name: q.unit for q in model.states}
+    return [t for name in structure(model).dynamic for t in _pairs(name, per(units[name], "s"), model, scales, bases)]
+
+
+def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> list[Term]:
     states, inputs = [q.name for q in model.states], [q.name for q in model.inputs]
     periodic = {q.name for q in model.states if q.periodic}
     terms: list[Term] = []
-    if len(states) + len(inputs) > MOST_ARGUMENTS:
-        return terms
     bases = {}
     for a in (*states, *inputs):
         waves, shares = _harmonics(a) if a in periodic else _sines(a, f"size_of_{a}")
-        bases[a] = list(zip(waves, shares, strict=True))[:PAIR_BASES]
+        bases[a] = list(zip(waves, shares, strict=True))[:most]
     for a, b in combinations((*states, *inputs), 2):
         if a not in states:
             continue

@@ -1,0 +1,108 @@
+"""A last look at what a chosen model leaves: is it a function of two arguments?
+
+Functions of two arguments are many and wide, so the program of a search does not carry them. Where nothing else was left
+they are screened without a program (`promising`); the best are compiled into a small one with the chosen effects, fitted
+from the chosen optimum, and judged like everything else: by evidence and on held-out episodes.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.fit import Fitter, Lane
+from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.promising import promised
+from simpel_cli.discovery.selection import ACCEPT, Search, Trial
+from simpel_cli.discovery.setup import Key, Setup, key_of
+from simulators.effects import Term, functions_of_two
+
+BASES = 4  # waves per argument
+MOST_FITTED = 2
+SHARE = 0.5  # of the largest promise, for a second one to be fitted
+MOST_ARGUMENTS = 10
+
+
+class Interaction(NamedTuple):
+    """A function of two arguments that was fitted."""
+
+    term: Term
+    gain: float  # in evidence, nats
+    gate: Gate
+
+
+def interaction(
+    search: Search,
+    assessor: Assessor,
+    chosen: Trial,
+    attach: Callable[..., Setup],
+    lanes: int,
+    told: Callable[[str], None] = lambda _: None,
+) -> Interaction | None:
+    """Return the function of two arguments that the data ask for beside the chosen terms; None where there is none.
+
+    Args:
+        search: that was run.
+        assessor: of its models.
+        chosen: the model that it ended with.
+        attach: (kept, extra) -> the setup of a program with these terms alone.
+        lanes: fits that run side by side.
+        told: is told what goes on.
+    """
+    model = search.plan.augmented.model
+    if len(model.states) + len(model.inputs) > MOST_ARGUMENTS:
+        return None
+    here: set[Key] = {key_of(t) for t in search.terms}
+    terms = [t for t in functions_of_two(model, search.plan.scales, BASES) if key_of(t) not in here]
+    gains = promised(search, assessor, chosen, terms)
+    order = sorted(range(len(terms)), key=lambda i: -gains[i])
+    going = [terms[i] for i in order[:MOST_FITTED] if gains[i] > max(ACCEPT, SHARE * gains[order[0]])]
+    if not going:
+        return None
+    told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
+    kept = {key_of(search.terms[t]) for t in chosen.terms}
+    plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows)
+    _, n_r, n_q = plan.coordinates.sizes
+    knobs = sum(len(search.terms[t].knobs) for t in chosen.terms) + max(len(t.knobs) for t in going)
+    small = Search(
+        plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=lanes, width=len(model.params) + n_r + n_q + knobs)
+    )
+    names = [key_of(t) for t in small.terms]
+    own = tuple(names.index(key_of(search.terms[t])) for t in chosen.terms)
+    start = Lane(carried(search.plan, chosen.optimum.z, plan), small.free(own), small.ones)
+    before = small.best(own, small.fitter([start]))
+    trials = small.add(before, [names.index(key_of(t)) for t in going]).trials
+    search.tried += len(going)
+    if not trials:
+        return None
+    after = trials[0]
+    # so that the smaller model has had every chance that the larger one had
+    again = Lane(small.off(after.optimum.z, after.terms[-1:]), small.free(own), small.ones)
+    before = small.best(own, small.fitter([again]))
+    gain = after.optimum.log_evidence - before.optimum.log_evidence
+    if not gain > ACCEPT:
+        return None
+    return Interaction(
+        small.terms[after.terms[-1]], float(gain), gate(small, Assessor(plan, assessor.horizon), before, after)
+    )
+
+
+def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:
+    """Carry unit coordinates from one setup to another, by the names of parameters, channels and driven states."""
+    values = {name: old.coordinates.value(i, float(z[i])) for i, name in enumerate(names_of(old))}
+    start = new.start.copy()
+    for i, name in enumerate(names_of(new)):
+        if name in values:
+            start[i] = new.coordinates.unit(i, values[name])
+    return start
+
+
+def names_of(plan: Setup) -> list[str]:
+    """Return a name for every unknown of a setup."""
+    states = [q.name for q in plan.augmented.model.states]
+    return [
+        *(q.name for q in plan.augmented.params),
+        *(f"noise of {name}" for name in plan.augmented.measured),
+        *(f"process noise of {states[i]}" for i in plan.coordinates.driven),
+    ]
