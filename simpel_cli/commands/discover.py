@@ -98,7 +98,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     recording = recording._replace(checks=(*recording.checks, outliers))
     selection = search.run(base)
     selection, gates = _gated(search, assessor, selection, terminal)
-    selection = _of_two(search, assessor, selection, attach, options, terminal)
+    selection, gates = _of_two(search, assessor, selection, gates, attach, options, terminal)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,
@@ -208,19 +208,26 @@ def _of_two(
     search: Search,
     assessor: Assessor,
     selection: Selection,
+    gates: list[Gate],
     attach: Callable[..., Setup],
     options: Discovery,
     terminal: Terminal,
-) -> Selection:
-    """Where nothing was left, look once more whether what remains is a function of two arguments."""
-    if selection.remainder is not None:
-        return selection
+) -> tuple[Selection, list[Gate]]:
+    """Look once more whether what is left is a function of two arguments."""
+    known = selection.remainder[1] if selection.remainder else 0.0
     told = lambda text: terminal.line(text, "search")  # noqa: E731
-    found = interaction(search, assessor, selection.chosen, attach, options.lanes, told)
+    found = interaction(search, assessor, selection.chosen, attach, options.lanes, told, known)
     if found is None:
-        return selection
+        return selection, gates
     _told(f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}", found.gate, terminal)
-    return selection._replace(remainder=(found.term, found.gain)) if found.gate.passed else selection
+    if not found.gate.passed:
+        return selection, gates
+    gone = [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
+    if gone:
+        told(f"beside it {' and '.join(gone)} is not needed")
+        selection = search.cut(selection, found.kept)
+        gates = [gates[i] for i in found.kept if i < len(gates)]
+    return selection._replace(remainder=(found.term, found.gain)), gates
 
 
 def _told(what: str, judged: Gate, terminal: Terminal) -> None:

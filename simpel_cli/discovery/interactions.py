@@ -1,4 +1,4 @@
-"""A last look at what a chosen model leaves: is it a function of two arguments?
+"""A last look at what a chosen model leaves, whether it is a function of two arguments.
 
 Functions of two arguments are many and wide, so the program of a search does not carry them. Where nothing else was left
 they are screened without a program (`promising`); the best are compiled into a small one with the chosen effects, fitted
@@ -25,10 +25,18 @@ MOST_ARGUMENTS = 10
 
 
 class Interaction(NamedTuple):
-    """A function of two arguments that was fitted."""
+    """A function of two arguments that earned its place.
+
+    Args:
+        term: what it is.
+        kept: places of the chosen effects that still earn theirs beside it.
+        gain: in evidence, over the model with those effects, nats.
+        gate: over the same.
+    """
 
     term: Term
-    gain: float  # in evidence, nats
+    kept: tuple[int, ...]
+    gain: float
     gate: Gate
 
 
@@ -39,6 +47,7 @@ def interaction(
     attach: Callable[..., Setup],
     lanes: int,
     told: Callable[[str], None] = lambda _: None,
+    known: float = 0.0,
 ) -> Interaction | None:
     """Return the function of two arguments that the data ask for beside the chosen terms; None where there is none.
 
@@ -49,15 +58,15 @@ def interaction(
         attach: (kept, extra) -> the setup of a program with these terms alone.
         lanes: fits that run side by side.
         told: is told what goes on.
+        known: evidence that a function of one argument earns there, which one of two has to beat, nats.
     """
     model = search.plan.augmented.model
     if len(model.states) + len(model.inputs) > MOST_ARGUMENTS:
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
     terms = [t for t in functions_of_two(model, search.plan.scales, BASES) if key_of(t) not in here]
-    gains = promised(search, assessor, chosen, terms)
-    order = sorted(range(len(terms)), key=lambda i: -gains[i])
-    going = [terms[i] for i in order[:MOST_FITTED] if gains[i] > max(ACCEPT, SHARE * gains[order[0]])]
+    found = sorted(zip(promised(search, assessor, chosen, terms), terms, strict=True), key=lambda p: -p[0].gain)
+    going = [sized(t, p.size) for p, t in found[:MOST_FITTED] if p.gain > max(known + ACCEPT, SHARE * found[0][0].gain)]
     if not going:
         return None
     told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
@@ -66,7 +75,8 @@ def interaction(
     _, n_r, n_q = plan.coordinates.sizes
     knobs = sum(len(search.terms[t].knobs) for t in chosen.terms) + max(len(t.knobs) for t in going)
     small = Search(
-        plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=lanes, width=len(model.params) + n_r + n_q + knobs)
+        plan,
+        Fitter(plan.rule, plan.coordinates, plan.windows, lanes=lanes, width=len(model.params) + n_r + n_q + knobs),
     )
     names = [key_of(t) for t in small.terms]
     own = tuple(names.index(key_of(search.terms[t])) for t in chosen.terms)
@@ -76,16 +86,24 @@ def interaction(
     search.tried += len(going)
     if not trials:
         return None
-    after = trials[0]
+    whole, new = trials[0], trials[0].terms[-1]
     # so that the smaller model has had every chance that the larger one had
-    again = Lane(small.off(after.optimum.z, after.terms[-1:]), small.free(own), small.ones)
-    before = small.best(own, small.fitter([again]))
-    gain = after.optimum.log_evidence - before.optimum.log_evidence
-    if not gain > ACCEPT:
+    before = small.best(own, small.fitter([Lane(small.off(whole.optimum.z, (new,)), small.free(own), small.ones)]))
+    if not whole.optimum.log_evidence - before.optimum.log_evidence > known + ACCEPT:
         return None
-    return Interaction(
-        small.terms[after.terms[-1]], float(gain), gate(small, Assessor(plan, assessor.horizon), before, after)
-    )
+    after = small.prune(whole)[0]  # an effect that was named for want of this function is needed no longer
+    if new not in after.terms:
+        return None
+    rest = tuple(t for t in own if t in after.terms)
+    before = small.best(rest, small.fitter(small.less(after, rest)))
+    gain = after.optimum.log_evidence - before.optimum.log_evidence
+    judged = gate(small, Assessor(plan, assessor.horizon), before, after)
+    return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
+
+
+def sized(term: Term, size: float) -> Term:
+    """Return a function with that share of the standard deviations of its weights."""
+    return term._replace(knobs=tuple(k._replace(low=size * k.low, high=size * k.high) for k in term.knobs))
 
 
 def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:

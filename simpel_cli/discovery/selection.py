@@ -239,19 +239,23 @@ class Search:
         if not beaten:
             return found
         kept = [i for i in range(len(unnamed)) if i not in beaten]
+        left = self.cut(found, kept)
+        winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
+        gain = float(winner.optimum.log_evidence - left.chosen.optimum.log_evidence)
+        return left._replace(remainder=(self.terms[winner.terms[-1]], gain))
+
+    def cut(self, found: Selection, kept: Sequence[int]) -> Selection:
+        """Return what is left of a selection where only the chosen effects at these places are kept."""
         rest = tuple(found.chosen.terms[i] for i in kept)
         chosen = self.best(rest, self.fitter(self.less(found.chosen, rest)))
         path = [t for t in found.path if set(t.terms) <= set(rest)]
         path = path if set(path[-1].terms) == set(rest) else [*path, chosen]
-        winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
-        gain = float(winner.optimum.log_evidence - chosen.optimum.log_evidence)
         return found._replace(
             base=found.base if rest else chosen,
             chosen=chosen,
             path=(*path[:-1], chosen),
             classes=tuple(found.classes[i] for i in kept),
             gains=tuple(found.gains[i] for i in kept),
-            remainder=(self.terms[winner.terms[-1]], gain),
         )
 
     def less(self, current: Trial, rest: tuple[int, ...]) -> list[Lane]:

@@ -3,7 +3,8 @@
     d[k+1] = F[k] d+[k] + dt/2 (F[k] a[k] + a'[k]),    d+[k] = (I - K[k] H[k]) d[k],    de[k] = -H[k] d[k]
 
 a[k] is the force at the filtered state of row k, a'[k] at the one predicted from it, both with the input of row k. So
-forces without number are tried on one run of the filter, and no program is compiled for them.
+forces without number are tried on one run of the filter, and no program is compiled for them. What they do to the gains K, by
+way of the slopes F, is left out.
 
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised).
 """
