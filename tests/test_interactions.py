@@ -1,6 +1,9 @@
 """Functions of two arguments that a simulator lacks: seen without a program, fitted, and not taken for process noise."""
 
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,19 +11,24 @@ import numpy as np
 import pytest
 from test_discovery_filter import DT, LOAD, model, p_of, recording
 
+from simpel_cli.commands.discover import _gated, _of_two
+from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.filter import Noise, still
 from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.interactions import Interaction, carried, interaction, names_of
+from simpel_cli.discovery.interactions import carried, names_of
 from simpel_cli.discovery.selection import Search, Selection
 from simpel_cli.discovery.sensitivity import shifts, waves
+from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Setup, key_of, setup
 from simpel_cli.discovery.setup import test_windows as windows_of_tests
 from simpel_cli.discovery.verdict import verdict_of
-from simulators.effects import functions_of_two
+from simulators.effects import Expression, functions_of_two
+from simulators.model import Declared
 
 NOISE, ROWS = 0.02, 40
+FRICTION = Expression("friction", acts_on="v", term="-c*v", parameters={"c": {"range": [0, 2], "unit": "1/s"}})
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +80,8 @@ def test_unknowns_are_carried_by_name_into_a_program_with_other_terms_and_bounds
     np.testing.assert_array_equal(new[knobs], other.start[knobs])
 
 
-def lane(drag: float, shaken: float, seed: int) -> Recording:
-    """Episodes of dv/dt = 1.3 u - 0.7 v - drag s^2 v, with process noise of `shaken` m/s per root second."""
+def lane(drag: Callable[[float], float], shaken: float, seed: int) -> Recording:
+    """Episodes of dv/dt = 1.3 u - 0.7 v - drag(s) v, with process noise of `shaken` m/s per root second."""
     random, fine, episodes = np.random.default_rng(seed), 40, []
     for k in range(7):
         s, v, states, inputs = random.uniform(-1.0, 1.0), random.normal(), [], np.zeros(ROWS)
@@ -81,7 +89,7 @@ def lane(drag: float, shaken: float, seed: int) -> Recording:
             states.append([s, v])
             inputs[i] = wanted - 1.5 * s  # or it would run away
             for _ in range(fine):
-                push = 1.3 * inputs[i] - 0.7 * v - drag * s**2 * v
+                push = 1.3 * inputs[i] - 0.7 * v - drag(s) * v
                 s += v * DT / fine
                 v += push * DT / fine + shaken * np.sqrt(DT / fine) * random.normal()
         measured = np.array(states) + NOISE * random.normal(size=(ROWS, 2))
@@ -91,35 +99,63 @@ def lane(drag: float, shaken: float, seed: int) -> Recording:
     )
 
 
-def looked(data: Recording) -> tuple[Search, Assessor, Selection, Interaction | None]:
-    """A search with one named effect, and the last look at what it leaves."""
-    attach = partial(setup, model(), data, (), [LOAD], 2)
+def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, Selection]:
+    """A search by a simulator whose only friction is 0.7 1/s, and the last look at what it leaves."""
+    glider = Declared(
+        "glider", dt=DT,
+        states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-5, 5]}},
+        inputs={"u": {"unit": "V", "range": [-9, 9]}},
+        parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
+        dynamics={"s": "v", "v": "b*u - 0.7*v"},
+    ).model()  # fmt: skip
+    attach = partial(setup, glider, data, (), [FRICTION], 2)
     plan = attach()
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=11))
-    assessor, selection = Assessor(plan, 10), search.run()
-    return search, assessor, selection, interaction(search, assessor, selection.chosen, attach, 4)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
+    assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
+    selection, gates = _gated(search, assessor, search.run(), terminal)
+    left, gates = _of_two(search, assessor, selection, gates, attach, Discovery(), terminal)
+    assert len(gates) == len(left.chosen.terms)
+    return search, assessor, selection, left
 
 
-def test_a_friction_that_depends_on_the_position_is_noticed() -> None:
-    data = lane(0.5, 0.0, 0)
-    search, assessor, selection, found = looked(data)
-    assert found is not None
-    assert found.gate.passed
-    assert found.gain > 20
-    selection = selection._replace(remainder=(found.term, found.gain))
+def said(data: Recording, search: Search, assessor: Assessor, left: Selection) -> dict[str, Any]:
     windows = windows_of_tests(search.plan, data.test, ())
-    before, learnt = (assessor(selection.chosen.optimum.z, w) for w in (windows, search.plan.windows))
-    said = verdict_of(search, selection, [], before, before, learnt, windows, data.checks, 10, 0.0)
-    assert said["verdict"] == "unexplained"
-    assert said["remainder"]["acts_on"] == "v"
-    assert said["remainder"]["depends_on"] == ["s", "v"]
+    before, learnt = (assessor(left.chosen.optimum.z, w) for w in (windows, search.plan.windows))
+    return verdict_of(search, left, [], before, before, learnt, windows, data.checks, 10, 0.0)
+
+
+def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> None:
+    data = lane(lambda s: 0.3 * s, 0.0, 0)
+    search, assessor, _, left = looked(data, tmp_path)
+    found = said(data, search, assessor, left)
+    assert found["verdict"] == "unexplained"
+    assert found["effects"] == []
+    assert found["remainder"]["acts_on"] == "v"
+    assert found["remainder"]["depends_on"] == ["s", "v"]
+    assert found["remainder"]["log_evidence_gain"] > 20
+
+
+def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
+    data = lane(lambda s: 0.5 * s**2, 0.0, 0)
+    search, assessor, first, left = looked(data, tmp_path)
+    assert first.chosen == left.chosen
+    found = said(data, search, assessor, left)
+    assert found["verdict"] == "effect"
+    assert [e["name"] for e in found["effects"]] == ["friction"]
+    assert found["remainder"]["depends_on"] == ["s", "v"]
+    without = search.cut(left, ())
+    assert (without.chosen.terms, without.classes, without.gains) == ((), (), ())
+    assert without.base == without.chosen == without.path[-1]
+    gain = left.chosen.optimum.log_evidence - without.chosen.optimum.log_evidence
+    np.testing.assert_allclose(gain, left.gains[0], atol=0.5)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_process_noise_is_no_function_of_two(seed: int) -> None:
-    search, _, selection, found = looked(lane(0.0, 0.3, seed))
-    assert selection.chosen.terms == ()
-    assert found is None
+def test_process_noise_is_no_function_of_two(tmp_path: Path, seed: int) -> None:
+    search, _, first, left = looked(lane(lambda s: 0.0, 0.3, seed), tmp_path)
+    assert first == left
+    assert left.chosen.terms == ()
+    assert left.remainder is None
     coordinates = search.plan.coordinates
-    q = coordinates.value(len(coordinates.low) - 2, selection.chosen.optimum.z[-2])
+    q = coordinates.value(len(coordinates.low) - 2, left.chosen.optimum.z[-2])
     assert 0.2 < q < 0.4  # and it was there to be taken for one

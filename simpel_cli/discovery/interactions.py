@@ -5,7 +5,7 @@ they are screened without a program (`promising`); the best are compiled into a 
 from the chosen optimum, and judged like everything else: by evidence and on held-out episodes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +13,12 @@ import numpy as np
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter, Lane
 from simpel_cli.discovery.gate import Gate, gate
-from simpel_cli.discovery.promising import promised
+from simpel_cli.discovery.promising import Promise, promised
 from simpel_cli.discovery.selection import ACCEPT, Search, Trial
 from simpel_cli.discovery.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 
-BASES = 4  # waves per argument
+BASES = (2, 4)  # waves per argument: a function that needs few is seen sooner with few
 MOST_FITTED = 2
 SHARE = 0.5  # of the largest promise, for a second one to be fitted
 MOST_ARGUMENTS = 10
@@ -64,9 +64,8 @@ def interaction(
     if len(model.states) + len(model.inputs) > MOST_ARGUMENTS:
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
-    terms = [t for t in functions_of_two(model, search.plan.scales, BASES) if key_of(t) not in here]
-    found = sorted(zip(promised(search, assessor, chosen, terms), terms, strict=True), key=lambda p: -p[0].gain)
-    going = [sized(t, p.size) for p, t in found[:MOST_FITTED] if p.gain > max(known + ACCEPT, SHARE * found[0][0].gain)]
+    terms = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
+    going = _worth_a_fit(promised(search, assessor, chosen, terms), terms, known + ACCEPT)
     if not going:
         return None
     told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
@@ -99,6 +98,17 @@ def interaction(
     gain = after.optimum.log_evidence - before.optimum.log_evidence
     judged = gate(small, Assessor(plan, assessor.horizon), before, after)
     return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
+
+
+def _worth_a_fit(promises: Sequence[Promise], terms: Sequence[Term], least: float) -> list[Term]:
+    """Return the functions that promise most, each with as many waves and of the size that promise most of it."""
+    best: dict[Key, tuple[float, Term]] = {}
+    for promise, term in zip(promises, terms, strict=True):
+        gain = promise.gain - float(np.log(len(BASES)))
+        if gain > best.get(key_of(term), (-np.inf, term))[0]:
+            best[key_of(term)] = gain, sized(term, promise.size)
+    order = sorted(best.values(), key=lambda found: -found[0])
+    return [term for gain, term in order[:MOST_FITTED] if gain > max(least, SHARE * order[0][0])]
 
 
 def sized(term: Term, size: float) -> Term:
