@@ -92,34 +92,35 @@ def _tried(
     mean, following = (np.asarray(a) for a in (told.track.mean, np.roll(told.track.predicted, -1, axis=1)))
     inputs = Forces(plan.rule, plan.coordinates, dt).inputs(z, windows)
     innovation = np.asarray(told.track.innovation)
-    scale = windows.ok / np.sqrt(np.asarray(told.track.variance))
-    error = (innovation * scale).ravel()
-    known = _known(search, assessor, chosen, z, innovation, scale)
+    ok = windows.ok > 0
+    std = np.sqrt(np.asarray(told.track.variance))
+    error = innovation[ok] / std[ok]
+    if not (np.isfinite(error).all() and np.isfinite(std[ok]).all()):  # with so little noise the filter diverges
+        return -np.inf, [[-np.inf] * len(SIZES) for _ in functions]
+    known = _known(search, assessor, chosen, z, innovation) / std[ok][:, None]
+    u, size, _ = np.linalg.svd(known, full_matrices=False)
+    known = u[:, size**2 > LEAST_CURVATURE]  # what the data tell of them; elsewhere the prior holds them
     left = error - known @ (known.T @ error)
     reached = float(told.log_likelihood.sum() + 0.5 * (error @ error - left @ left))
     gains = []
     for term, augmented, p in functions:
         here, there = waves(augmented, term, p, [(mean, inputs), (following, inputs)])
-        columns = shifts(told.track, windows.ok, here, there, row, dt) * scale[..., None]
-        gains.append(_evidence(columns.reshape(len(error), -1), left, known))
-    return reached if np.isfinite(reached) else -np.inf, gains
+        columns = shifts(told.track, windows.ok, here, there, row, dt)[ok] / std[ok][:, None]
+        gains.append(_evidence(columns, left, known))
+    return reached, gains
 
 
-def _known(
-    search: Search, assessor: Assessor, chosen: Trial, z: np.ndarray, innovation: np.ndarray, scale: np.ndarray
-) -> np.ndarray:
-    """Orthonormal basis of what the unknowns of the chosen model can do to the innovations, (N, n)."""
-    columns = []
+def _known(search: Search, assessor: Assessor, chosen: Trial, z: np.ndarray, innovation: np.ndarray) -> np.ndarray:
+    """Change of the innovations where something was measured per unknown of the chosen model, (N, n)."""
+    ok = search.plan.windows.ok > 0
+    columns = [np.zeros((int(ok.sum()), 0))]
     for i in (i for i in search.free(chosen.terms) if i not in search.noise):
         near = z.copy()
         step = NUDGE if z[i] < 0.5 else -NUDGE
         near[i] += step
-        change = (np.asarray(assessor(near, search.plan.windows).track.innovation) - innovation) / step
-        columns.append(np.nan_to_num(change * scale).ravel())
-    if not columns:
-        return np.zeros((scale.size, 0))
-    u, size, _ = np.linalg.svd(np.array(columns).T, full_matrices=False)
-    return u[:, size**2 > LEAST_CURVATURE]  # what the data tell of them; elsewhere the prior holds them
+        change = (np.asarray(assessor(near, search.plan.windows).track.innovation) - innovation)[ok] / step
+        columns.append(np.nan_to_num(change, posinf=0.0, neginf=0.0)[:, None])
+    return np.concatenate(columns, axis=1)
 
 
 def _evidence(columns: np.ndarray, left: np.ndarray, known: np.ndarray) -> list[float]:

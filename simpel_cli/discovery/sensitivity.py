@@ -3,7 +3,7 @@
     d[k+1] = F[k] d+[k] + dt/2 (F[k] a[k] + a'[k]),    d+[k] = (I - K[k] H[k]) d[k],    de[k] = -H[k] d[k]
 
 a[k] is the force at the filtered state of row k, a'[k] at the one predicted from it, both with the input of row k. So
-forces without number are tried on one run of the filter, and no program is compiled for them. What they do to the gains K, by
+any number of forces is tried on one run of the filter, and no program is compiled for them. What they do to the gains K, by
 way of the slopes F, is left out.
 
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised).
@@ -38,11 +38,11 @@ def shifts(track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarra
         cov = np.array(track.predicted_cov[:, k])
         for j in range(ok.shape[2]):
             h = track.slope[:, k, j]
-            told = ok[:, k, j, None]
-            change = -np.einsum("wi,win->wn", h, d) * told
+            told = ok[:, k, j, None] > 0
+            change = np.where(told, -np.einsum("wi,win->wn", h, d), 0.0)
             found[:, k, j] = change
             gain = np.einsum("wij,wj->wi", cov, h)
-            pull = gain * (told / track.variance[:, k, j, None])
+            pull = np.where(told, gain / track.variance[:, k, j, None], 0.0)
             d = d + pull[:, :, None] * change[:, None]
             cov = cov - pull[:, :, None] * gain[:, None]
         f = track.jacobian[:, k]
@@ -63,7 +63,7 @@ def waves(
         points: states (..., nx) and inputs (..., nu).
     """
     function = augmented.function
-    x, u, q = (casadi.SX.sym(n, function.size1_in(i)) for i, n in enumerate("xup"))
+    x, u, q = (augmented.model.symbol.sym(n, function.size1_in(i)) for i, n in enumerate("xup"))
     row = [s.name for s in augmented.model.states].index(term.acts_on)
     slope = casadi.jacobian(function(x, u, q)[0][row], q)[:, augmented.rows(term)]
     program = casadi.Function("waves", [x, u, q], [casadi.densify(slope).T])

@@ -17,6 +17,7 @@ class Discovery:
         lanes: fits that run side by side in the compiled program.
         room: unknowns of effects that a hypothesis can have at once; time grows with it.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
+            Without it, they are looked for in what is left at the end.
     """
 
     horizon: int = 20
