@@ -5,19 +5,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_discovery_filter import DT, LOAD, model, p_of, recording
+from test_discovery_filter import DT, LOAD, model, recording
 
 from simpel_cli.commands.discover import _gated, _of_two
 from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
-from simpel_cli.discovery.filter import Noise, still
+from simpel_cli.discovery.coordinates import CUT
 from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.interactions import carried, names_of
+from simpel_cli.discovery.interactions import BASES, carried, names_of
 from simpel_cli.discovery.selection import Search, Selection
 from simpel_cli.discovery.sensitivity import shifts, waves
 from simpel_cli.discovery.settings import Discovery
@@ -39,27 +37,24 @@ def plan() -> Setup:
 def test_innovations_shift_as_those_of_a_filter_that_knows_the_force(plan: Setup) -> None:
     """Against differences of the filter itself, in every weight of a function that its program carries."""
     term = next(t for t in plan.augmented.terms if t.depends_on == ("v",))
-    windows, p = plan.windows, p_of(plan, 0.2)
-    noise = Noise(jnp.array([0.05, 0.07]), jnp.array([0.0, 0.3]))
-    ok = windows.ok[1].copy()
-    ok[3, 0] = ok[7] = 0.0
-    u, start, spread = (jnp.asarray(a) for a in (windows.u[1], windows.start[1], windows.spread[1]))
-    track = jax.jit(lambda p, noise, y: plan.rule.track(still(p), noise, y, jnp.asarray(ok), u, start, spread))
+    assessor, z = Assessor(plan, 3), plan.start
+    ok = plan.windows.ok.copy()
+    ok[1, 3, 0] = ok[1, 7] = 0.0
     # measurements that the model predicts: what the force does to the filter's gain, which is left out, then does nothing
-    y = track(jnp.asarray(p), Noise(jnp.full(2, 1e6), jnp.zeros(2)), jnp.zeros(ok.shape)).predicted
-    told = track(jnp.asarray(p), noise, y)
-    batch = type(told)(*(np.asarray(a)[None] for a in told))
-    inputs = windows.u[1][None, plan.lead : plan.lead + ok.shape[0]]
-    after = np.roll(batch.predicted, -1, axis=1)
-    force = waves(plan.augmented, term, p, [(batch.mean, inputs), (after, inputs)])
-    found = shifts(batch, ok[None], *force, 1, plan.augmented.model.dt)[0]
-    for n, (row, knob) in enumerate(zip(plan.augmented.rows(term), term.knobs, strict=True)):
-        sd = (knob.high - knob.low) / 4
-        step = np.zeros_like(p)
-        step[row] = 1e-4 * sd
-        ahead, back = (np.asarray(track(jnp.asarray(p + s), noise, y).innovation) for s in (step, -step))
+    y = np.asarray(assessor(z, plan.windows._replace(ok=0 * ok)).track.predicted)
+    windows = plan.windows._replace(y=y, ok=ok)
+    track = assessor(z, windows).track
+    inputs = windows.u[:, plan.lead : plan.lead + ok.shape[1]]
+    p = np.array([plan.coordinates.value(i, z[i]) for i in range(len(plan.augmented.params))])
+    following = np.roll(track.predicted, -1, axis=1)
+    force = waves(plan.augmented, term, p, [(np.asarray(track.mean), inputs), (following, inputs)])
+    found = shifts(track, ok, *force, 1, plan.augmented.model.dt)
+    for n, row in enumerate(plan.augmented.rows(term)[: max(BASES)]):
+        step = np.zeros_like(z)
+        step[row] = 1e-4 / (2 * CUT)  # of a standard deviation
+        ahead, back = (np.asarray(assessor(z + s, windows).track.innovation) for s in (step, -step))
         change = (ahead - back) / 2e-4 * ok
-        # the shortest wave turns a good part of its period within a row
+        # the force is a straight line within a row, which the shorter waves are not
         assert np.linalg.norm(found[..., n] - change) < 0.06 * np.linalg.norm(change)
 
 
