@@ -70,7 +70,8 @@ def waves(
     sd = np.array([(knob.high - knob.low) / 4 for knob in term.knobs])
     found = []
     for states, inputs in points:
-        flat = states.reshape(-1, states.shape[-1]).T, inputs.reshape(-1, inputs.shape[-1]).T
+        # a model may have no input
+        flat = tuple(a.reshape(int(np.prod(states.shape[:-1])), a.shape[-1]).T for a in (states, inputs))
         value = np.asarray(program(*flat, np.tile(p[:, None], flat[0].shape[1])))
         found.append(np.nan_to_num(value.T * sd, posinf=0.0, neginf=0.0).reshape(*states.shape[:-1], len(sd)))
     return found
