@@ -161,7 +161,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
     rows = len(y)
     windows = Windows(
         y=y[None], ok=np.isfinite(y[None]) * 1.0, u=np.zeros((1, rows, 1)), start=system.m[None], spread=np.ones((1, len(b))),
-        episode=np.zeros(1, int),
+        episode=np.zeros(1, int), begin=np.zeros(1, int),
     )  # fmt: skip
     return Forces(rule, coordinates, DT)(np.zeros(1), system.track(y), windows)
 

@@ -86,7 +86,12 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     recording = clean.recording
     bad = [c for c in recording.checks if not c.ok]
     terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")
-    attach = partial(setup, model, recording, declared_noise, effects, options.substeps, pairs=options.pairs)
+    attach = partial(
+        setup, model, recording, declared_noise, effects, options.substeps, pairs=options.pairs, most_rows=options.rows
+    )
+    rows = sum(len(e.time) for e in recording.train)
+    if rows > options.rows:
+        terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
     kept = _kept(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal)
     plan = attach(kept=kept)
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room

@@ -79,18 +79,25 @@ class Coordinates(NamedTuple):
 
 DECLARED_SD = 0.1  # of the logarithm of a measurement noise that the user declared
 ESTIMATED_SPAN = (1 / 30, 3.0)  # factors within which a noise that was estimated from differences may lie
+MODEL_ERROR = 0.01  # of a channel's magnitude, which its noise may reach however clean its differences are
 
 
 def coordinates_of(
-    augmented: Augmented, r: np.ndarray, declared: np.ndarray, q_low: np.ndarray, q_high: np.ndarray
+    augmented: Augmented,
+    r: np.ndarray,
+    declared: np.ndarray,
+    size: np.ndarray,
+    q_low: np.ndarray,
+    q_high: np.ndarray,
 ) -> Coordinates:
     """Return the coordinates of all unknowns.
 
     Args:
         augmented: model with candidates.
         r: (ny,) measurement noise. Third differences take what the model does for noise where the data are clean, so an
-            estimate may be far too large, hardly too small.
+            estimate may be far too large. It is too small where a filter or a slow sensor error made the record smooth.
         declared: (ny,) whether the user declared it.
+        size: (ny,) magnitude of the channel.
         q_low: (n_driven,) lower bounds of the process noise.
         q_high: (n_driven,) upper bounds.
     """
@@ -104,9 +111,9 @@ def coordinates_of(
         else:
             middle, sd = (low + high) / 2, (high - low) / 4
             rows.append((middle - CUT * sd, middle + CUT * sd, prior == "lognormal", True))
-    for value, known in zip(r, declared, strict=True):
-        factors = np.exp(np.array([-CUT, CUT]) * DECLARED_SD) if known else ESTIMATED_SPAN
-        rows.append((np.log(value * factors[0]), np.log(value * factors[1]), True, bool(known)))
+    for value, known, most in zip(r, declared, MODEL_ERROR * size, strict=True):
+        low, high = value * (np.exp(np.array([-CUT, CUT]) * DECLARED_SD) if known else np.array(ESTIMATED_SPAN))
+        rows.append((np.log(low), np.log(high if known else max(high, most)), True, bool(known)))
     rows += [(np.log(low), np.log(high), True, False) for low, high in zip(q_low, q_high, strict=True)]
     rows.append((0.0, 1.0, False, False))  # padding
     states = [q.name for q in augmented.model.states]

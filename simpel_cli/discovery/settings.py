@@ -16,6 +16,7 @@ class Discovery:
         substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 8 at most.
         lanes: fits that run side by side in the compiled program.
         room: unknowns of effects that a hypothesis can have at once; time grows with it.
+        rows: training rows that a search looks at, evenly spaced windows of a longer record; errors are of all test rows.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
             Without it, they are looked for in what is left at the end.
     """
@@ -24,6 +25,7 @@ class Discovery:
     substeps: int | None = None
     lanes: int = 4
     room: int = 9
+    rows: int = 3000
     pairs: bool = False
 
     def __post_init__(self) -> None:
@@ -31,7 +33,7 @@ class Discovery:
             raise ConfigError(
                 f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
             )
-        for name in ("horizon", "lanes", "room"):
+        for name in ("horizon", "lanes", "room", "rows"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"discovery.{name}: got {getattr(self, name)}; it must be at least 1.")
         if self.substeps is not None and self.substeps < 1:

@@ -11,7 +11,7 @@ from simpel_cli.discovery.augmented import Augmented, augment
 from simpel_cli.discovery.coordinates import Coordinates, coordinates_of
 from simpel_cli.discovery.filter import Filter, filter_of
 from simpel_cli.discovery.steps import substeps_needed
-from simpel_cli.discovery.windows import Windows, windows_of
+from simpel_cli.discovery.windows import Windows, thinned, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import BACKLASH, DELAY, LAG
@@ -47,6 +47,7 @@ def setup(
     pairs: bool = False,
     kept: Collection[Key] | None = None,
     extra: Sequence[Term] = (),
+    most_rows: int | None = None,
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -59,6 +60,7 @@ def setup(
         pairs: offer functions of two arguments.
         kept: terms to attach; None: all.
         extra: terms to attach beside them.
+        most_rows: of the windows, about; None: all.
 
     Raises:
         DataError: too few rows.
@@ -90,6 +92,8 @@ def setup(
         recording.train, [q.name for q in model.states], measured, recording.outputs, middle, spread, lead=lead,
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
+    if most_rows is not None:
+        windows = thinned(windows, most_rows)
     noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
     r = np.array(list(noise_std.values()))
     if substeps is None:
@@ -101,6 +105,7 @@ def setup(
         augmented,
         r,
         np.array([name in declared_noise for name in measured]),
+        np.array([scales.size[name] for name in measured]),
         typical * Q_BOUNDS[0],
         typical * Q_BOUNDS[1],
     )

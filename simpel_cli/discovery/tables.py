@@ -26,11 +26,10 @@ class Piece(NamedTuple):
 
 
 def pieces(windows: Windows, episodes: Sequence[Episode]) -> Iterator[Piece]:
-    """Yield the place of every window, in their order; windows of an episode follow each other."""
-    length, seen = windows.y.shape[1], dict.fromkeys(range(len(episodes)), 0)
-    for index in windows.episode.tolist():
-        begin, episode = seen[index], episodes[index]
-        seen[index] += length
+    """Yield the place of every window, in their order."""
+    length = windows.y.shape[1]
+    for index, begin in zip(windows.episode.tolist(), windows.begin.tolist(), strict=True):
+        episode = episodes[index]
         rows = np.arange(begin, min(begin + length, len(episode.time)))
         yield Piece(episode.name, rows, episode.time[rows])
 

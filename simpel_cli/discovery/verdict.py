@@ -8,6 +8,7 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
+from simpel_cli.discovery.setup import key_of
 from simpel_cli.discovery.twins import twins
 from simpel_cli.discovery.whiteness import memory
 from simpel_cli.discovery.windows import Windows
@@ -114,23 +115,24 @@ def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[
 def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
     term = search.terms[selection.chosen.terms[i]]
     rows = search.rows[selection.chosen.terms[i]]
-    same = [
-        search.terms[t.terms[-1]].effect
-        for t in selection.classes[i]
-        if twins(search, selection.chosen, (selection.chosen.terms[i], selection.chosen), (t.terms[-1], t))
+    others = [(search.terms[t.terms[-1]], t) for t in selection.classes[i]]
+    own = (selection.chosen.terms[i], selection.chosen)
+    alike = {key_of(other) for other, t in others if twins(search, selection.chosen, own, (t.terms[-1], t))}
+    same = [other.effect for other, _ in others if key_of(other) in alike and other.effect != term.effect]
+    members = [{"name": term.effect, "acts_on": term.acts_on, "same": True}] + [
+        {"name": t.effect, "acts_on": t.acts_on, "same": key_of(t) in alike or t.effect in term.same_as}
+        for t, _ in others
     ]
-    names = [term.effect] + [search.terms[t.terms[-1]].effect for t in selection.classes[i]]
-    places = {term.effect: term.acts_on} | {
-        search.terms[t.terms[-1]].effect: search.terms[t.terms[-1]].acts_on for t in selection.classes[i]
-    }
+    places = {m["name"]: m["acts_on"] for m in members[::-1]}
     before = _noise(search, selection.base)[1]
     after = _noise(search, selection.chosen)[1]
     return {
         "name": term.effect,
         "acts_on": term.acts_on,
         "meaning": term.meaning,
-        "class": list(dict.fromkeys(names)),
+        "class": list(dict.fromkeys(m["name"] for m in members)),
         "class_acts_on": places,
+        "class_members": members,
         "same_as": list(dict.fromkeys([*term.same_as, *same])),
         "log_evidence_gain": selection.gains[i],
         "held_out_gain": None if gate is None else gate._asdict(),
@@ -143,8 +145,16 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
 
 
 def _distinct(effect: dict[str, Any]) -> list[str]:
-    """Names of a class that some data could tell apart."""
-    return [n for n in effect["class"] if n == effect["name"] or n not in effect["same_as"]]
+    """Names of a class that some data could tell apart, with the place where a name has several."""
+    first, *others = effect["class_members"]
+    return _labels(effect, [first, *(m for m in others if not m["same"])])
+
+
+def _labels(effect: dict[str, Any], members: list[dict[str, Any]]) -> list[str]:
+    """Members of a class in words; with the place where a name acts on several."""
+    names = [m["name"] for m in effect["class_members"]]
+    words = [(m["name"].replace("_", " "), names.count(m["name"]) > 1, m["acts_on"]) for m in members]
+    return list(dict.fromkeys(f"{name} on {place}" if several else name for name, several, place in words))
 
 
 def _remainder(search: Search, selection: Selection) -> dict[str, Any] | None:
@@ -252,7 +262,7 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
         case "ambiguous":
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
-            names = " or ".join(n.replace("_", " ") for n in _distinct(tied))
+            names = " or ".join(_distinct(tied))
             also = (
                 f" Besides: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
                 if len(parts) > 1
@@ -270,6 +280,6 @@ def _phrase(effect: dict[str, Any]) -> str:
         f"{name} = {p['value']:.3g} ({p['low']:.3g}..{p['high']:.3g}) {p['unit']}"
         for name, p in effect["parameters"].items()
     )
-    twin = [n.replace("_", " ") for n in effect["class"] if n != effect["name"] and n in effect["same_as"]]
+    twin = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
     also = f", which here is the same as {' and '.join(twin)}" if twin else ""
     return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}"

@@ -25,6 +25,7 @@ class Windows(NamedTuple):
         start: (W, nx) guess of the first state.
         spread: (W, nx) standard deviation of the first state about it.
         episode: (W,) index of the episode, in the order given.
+        begin: (W,) row of the episode at which the window begins.
     """
 
     y: np.ndarray
@@ -33,11 +34,27 @@ class Windows(NamedTuple):
     start: np.ndarray
     spread: np.ndarray
     episode: np.ndarray
+    begin: np.ndarray
 
     @property
     def arrays(self) -> tuple[Array, ...]:
         """What the filter takes, window by window."""
         return tuple(jnp.asarray(a) for a in (self.y, self.ok, self.u, self.start, self.spread))
+
+
+def thinned(windows: Windows, rows: int) -> Windows:
+    """Leave evenly spaced windows of a long record: a search needs not every row of it to tell effects apart.
+
+    Args:
+        windows: all of them.
+        rows: that the rest may have, about; one window per episode stays in any case.
+    """
+    count, length = windows.ok.shape[:2]
+    most = max(rows // length, len(np.unique(windows.episode)))
+    if count <= most:
+        return windows
+    kept = np.unique(np.linspace(0, count - 1, most).round().astype(int))
+    return Windows(*(a[kept] for a in windows))
 
 
 def windows_of(
@@ -68,7 +85,15 @@ def windows_of(
     rows_of_longest = max(len(e.time) for e in episodes)
     pieces = max(at_least, -(-rows_of_longest // longest))
     length = -(-rows_of_longest // pieces)
-    rows: dict[str, list[np.ndarray]] = {"y": [], "ok": [], "u": [], "start": [], "spread": [], "episode": []}
+    rows: dict[str, list[np.ndarray]] = {
+        "y": [],
+        "ok": [],
+        "u": [],
+        "start": [],
+        "spread": [],
+        "episode": [],
+        "begin": [],
+    }
     for index, episode in enumerate(episodes):
         columns = [
             episode.states[:, list(states).index(n)] if n in states else episode.outputs[:, list(outputs).index(n)]
@@ -93,6 +118,7 @@ def windows_of(
             rows["start"].append(start)
             rows["spread"].append(spread)
             rows["episode"].append(np.array(index))
+            rows["begin"].append(np.array(begin))
     if not rows["y"]:
         raise DataError(
             f"data: none of {len(episodes)} episodes ({', '.join(e.name for e in episodes[:3])}"

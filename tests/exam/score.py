@@ -56,8 +56,8 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
 
 def _grade(effect: Mapping[str, Any], planted: Mapping[str, Any], gains: Gains) -> str:
     """Grade one claimed effect against one planted effect."""
-    places = dict(effect.get("class_acts_on", {})) | {effect["name"]: effect["acts_on"]}
-    names = [(n, places.get(n, effect["acts_on"])) for n in effect["class"]]
+    names = [(m["name"], m["acts_on"]) for m in effect.get("class_members", [])]
+    names = names or [(n, effect.get("class_acts_on", {}).get(n, effect["acts_on"])) for n in effect["class"]]
     own = {(n, planted["acts_on"]) for n in planted["accept"]}
     twins = {tuple(t.split("@")) for t in planted["twins"]}
     same = set(effect.get("same_as", []))
