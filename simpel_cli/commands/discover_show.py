@@ -21,7 +21,7 @@ KINDS = {
 MOST_NAMED = 6  # effects that were not found, in the terminal
 
 
-def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> Path:
+def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> None:
     """Print the verdict, draw the figures, write the report, and say where things lie and what to type next.
 
     Args:
@@ -32,9 +32,17 @@ def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: 
     """
     show(terminal, found, directory)
     commands = next_commands(found, directory, config)
-    sim = config["sim"]
-    path, noise = found["corrected_sim"], found["process_noise"]
-    report = write_report(
+    if config.get("report", True):
+        terminal.line(str(_reported(found, directory, config, commands)), "report")
+    else:
+        terminal.line(str(directory / "verdict.json"), "verdict")
+    for label, line in zip(["next", *[""] * len(commands)], commands, strict=False):
+        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+
+
+def _reported(found: dict[str, Any], directory: Path, config: dict[str, Any], commands: list[str]) -> Path:
+    sim, path, noise = config["sim"], found["corrected_sim"], found["process_noise"]
+    return write_report(
         directory / "report.html",
         title=f"simpel discover · {sim['name']} · {config.get('choices', {}).get('data', '')}".rstrip(" ·"),
         opening=found["summary"],
@@ -44,10 +52,6 @@ def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: 
         commands=commands,
         config=dump(config),
     )
-    terminal.line(str(report), "report")
-    for label, line in zip(["next", *[""] * len(commands)], commands, strict=False):
-        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
-    return report
 
 
 def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:

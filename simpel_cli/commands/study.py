@@ -73,7 +73,7 @@ class Study(NamedTuple):
 def settings_of(config: dict[str, Any]) -> Settings:
     """Build the `run:` group and refuse keys that no verb has."""
     for key in config:
-        if key not in (*GROUPS, "choices", "run_dir", "out", "close"):
+        if key not in (*GROUPS, "choices", "run_dir", "out", "close", "report"):
             raise ConfigError(f"{key}: no such key.{did_you_mean(key, list(GROUPS))} (groups: {', '.join(GROUPS)})")
     return build(config.get("run") or {}, "run", default=Settings)
 

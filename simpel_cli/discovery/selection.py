@@ -21,9 +21,10 @@ PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
 SHARE = 0.3  # of the largest promise, likewise
 SHARE_OF_OWN = 0.4  # of what the term promises whose place a rival would take
 KEPT = 4  # starts of a stage that are fitted in any case
-MOST_EFFECTS = 5
+MOST_EFFECTS = 8
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
 NEARLY = 0.01  # of a knob's range
+QUIETER = 0.1  # of the range of log q, than at the very start
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 STARTS = 6  # of the model as it is
 
@@ -95,7 +96,7 @@ class Search:
         knobs = self.terms[new].knobs
         lanes = []
         for s in range(max(len(k.starts) for k in knobs)):
-            start = z.copy()
+            start = self.loud(z)
             for row, knob in zip(self.rows[new], knobs, strict=True):
                 start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
             lanes.append(Lane(start, self.free(terms), self.ones if weight is None else weight))
@@ -103,10 +104,23 @@ class Search:
 
     def beside(self, before: Trial, new: int) -> Lane:
         """Start of a model with one term more at the optimum without it, the term all but switched off."""
-        start = before.optimum.z.copy()
+        start = self.loud(before.optimum.z)
         for row in self.rows[new]:
             start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
         return Lane(start, self.free((*before.terms, new)), self.ones)
+
+    def loud(self, z: np.ndarray) -> np.ndarray:
+        """Return a start with noise that a step in the wrong direction can hide in.
+
+        With little process noise a size that is off costs thousands of nats, and a fit creeps. And a wrong model follows
+        a sensor as if that had no noise: a better one has to find it again.
+        """
+        z = z.copy()
+        n_p, n_r, n_q = self.plan.coordinates.sizes
+        q, r = np.arange(n_p + n_r, n_p + n_r + n_q), np.arange(n_p, n_p + n_r)
+        z[q] = np.maximum(z[q], self.plan.start[q] - QUIETER)
+        z[r] = np.where(z[r] < NEARLY, self.plan.start[r], z[r])
+        return z
 
     def off(self, z: np.ndarray, terms: Sequence[int]) -> np.ndarray:
         """Switch terms off."""

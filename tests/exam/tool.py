@@ -35,7 +35,16 @@ def discover(folder: Path, run: str, effects: Sequence[str] = ()) -> Answer:
     if (directory / "verdict.json").exists():
         return Answer(directory, float("nan"))
     clear(directory)
-    words = ["discover", "--config-dir", str(folder), "sim=rig", "data=rig", "close=false", "run.quiet=true"]
+    words = [
+        "discover",
+        "--config-dir",
+        str(folder),
+        "sim=rig",
+        "data=rig",
+        "close=false",
+        "report=false",
+        "run.quiet=true",
+    ]
     words += [f"hydra.run.dir='{directory}'"] + ([f"effect=[{','.join(effects)}]"] if effects else [])
     began, here = time.perf_counter(), Path.cwd()
     said = io.StringIO()
