@@ -132,6 +132,35 @@ def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: fl
     assert 6 < errors[0] / errors[1] < 10  # third order in the time
 
 
+@pytest.mark.parametrize(("late", "lag"), [(0.0, 0.06), (0.06, 0.0), (0.1, 0.1), (0.3, 0.0), (0.25, 0.1)])
+def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float) -> None:
+    """With a slow model, whose rates are those of the input: the reading is the input's integral, delayed and lagged."""
+    effects = [
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        for kind in ("sensor_delay", "sensor_lag")
+    ]
+    plan = setup(model(), recording(), (), effects, 2)
+    names = [q.name for q in plan.augmented.params]
+    p = p_of_plan(plan, 1e-9, 1.0)
+    p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late, lag
+    u = np.random.default_rng(5).normal(size=ROWS)
+    held = np.concatenate([np.full(plan.lead, u[0]), u])
+    rows = jnp.zeros((ROWS, 2))
+    deaf, known = Noise(jnp.full(2, 1e6), jnp.zeros(2)), (jnp.zeros(2), jnp.full(2, 1e-9))
+    track, _ = plan.rule.track(jnp.asarray(p), deaf, rows, rows + 1, jnp.asarray(held)[:, None], *known)
+    fine = 400  # steps of a row, of the reference
+    times = (np.arange(-20 * fine, ROWS * fine) + 0.5) * DT / fine
+    slope = u[np.clip((times // DT).astype(int), 0, ROWS - 1)]
+    value = np.cumsum(slope) * DT / fine
+    value -= np.interp(0.0, times, value)
+    read = value.copy()
+    for k in range(1, len(read)):
+        read[k] = value[k] if lag == 0 else read[k - 1] + (value[k] - read[k - 1]) * (1 - np.exp(-DT / fine / lag))
+    expected = np.interp(np.arange(ROWS) * DT - late, times, read)
+    found = -np.asarray(track.innovation)[:, 1]
+    np.testing.assert_allclose(found[1:], expected[1:], atol=0.02 * np.abs(expected).max() * (lag > 0) + 2e-3)
+
+
 def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:
     """Exactly in a noise, and in a parameter up to what a row's Jacobian bends within the row."""
     coordinates = plan.coordinates

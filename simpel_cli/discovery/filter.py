@@ -27,6 +27,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from simpel_cli.discovery.augmented import Augmented
+from simpel_cli.discovery.late_sensors import back, echo, no_jumps, pushed
+from simpel_cli.discovery.points import along, apart, product
 from simpel_cli.discovery.slopes import movable, with_slope
 from simpel_cli.signals import arriving
 from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
@@ -195,27 +197,20 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         return jax.lax.scan(step, (x, unit, *nothing), u)[0]
 
-    def back(p: Array, rate: Array, rate_x: Array) -> tuple[Array, Array]:
-        """Return how far late sensors look back along the motion, (ny, nx, ...), and the time, (ny, 1, ...).
+    late_ones = bool(sensor_delays or sensor_lags)
 
-        A delay d and a lag tau act together as exp(-d s)/(1 + tau s), to second order
+    def late_by(p: Array) -> tuple[Array, Array]:
+        """Return delay d and lag tau of every sensor, (ny, ...)."""
+        return per_signal(p, sensor_delays, ny), per_signal(p, sensor_lags, ny)
 
-            y - (d + tau) y' + (d^2/2 + d tau + tau^2) y''
-
-        which holds while d and tau are short against the motion (the next term is about tau^3 times the third
-        derivative) and against the time since the input last changed: y' and y'' are those of the substep that just ended.
-        """
-        d, tau = (per_signal(p, rows, ny)[:, None] for rows in (sensor_delays, sensor_lags))
-        late, twice = d + tau, 0.5 * d**2 + d * tau + tau**2
-        return -late * rate[None] + twice * product(rate_x, rate[:, None])[None, :, 0], late
-
-    def seen(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> tuple[Array, Array, Array]:
+    def seen(p: Array, x: Array, u: Array, rate: Array, rate_x: Array, jumps: Array) -> tuple[Array, Array, Array]:
         """Return what the sensors read, its derivative in the state, and the latter if no sensor were late."""
         y, prompt = sensors(x, u, p)
-        if not (sensor_delays or sensor_lags):
+        if not late_ones:
             return y, prompt, prompt
-        shift, late = back(p, rate, rate_x)
-        return y + jnp.sum(prompt * shift, axis=1), prompt - late * product(prompt, rate_x), prompt
+        d, tau = late_by(p)
+        read = y + jnp.sum(prompt * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
+        return read, prompt - (d + tau)[:, None] * product(prompt, rate_x), prompt
 
     def wrapped(error: Array) -> Array:
         """Take a difference of angles the short way round; error: (ny, ...)."""
@@ -237,11 +232,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         u_sub, half = inputs(p, u), halved(noise)
 
         def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, tuple[Track, Held]]:
-            x, cov, u_before, rate, rate_x = carry
+            x, cov, u_before, rate, rate_x, jumps = carry
             y_k, ok_k, u_k = data
             predicted, predicted_cov = x, cov
             # the sensor is read at the row: what arrived up to it is the last substep before
-            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x)
+            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps)
+            if late_ones:
+                jumps = pushed(jumps, prompt, rate, rates(x, u_k[0], p)[0])
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
@@ -260,10 +257,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
             held = Held(jnp.stack(gains), prompt, rate_x)
-            return (following, after(cov, jacobian, half), u_k[-1], rate_after, rate_x_after), (out, held)
+            carry = following, after(cov, jacobian, half), u_k[-1], rate_after, rate_x_after, jumps
+            return carry, (out, held)
 
-        nothing = jnp.zeros_like(start), jnp.zeros((nx, *start.shape), start.dtype)
-        return jax.lax.scan(row, (start, of_start(spread), u_sub[0, 0], *nothing), (y, ok, u_sub))[1]
+        begin = (start, of_start(spread), u_sub[0, 0], *rates(start, u_sub[0, 0], p), no_jumps(ny, start))
+        return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
 
     def jacobian_of(given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
         """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
@@ -277,11 +275,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         u_sub, half = inputs(given.p, u), halved(noise)
 
         def row(carry: tuple[Array, ...], data: tuple[Any, ...]) -> tuple[tuple, tuple[Array, Array]]:
-            x, cov, u_before, rate = carry
+            x, cov, u_before, rate, jumps = carry
             y_k, ok_k, u_k, at_k, held_k = data
             read, predicted = moving_sensors(x, u_before, given), x
-            if sensor_delays or sensor_lags:
-                read = read + jnp.sum(held_k.prompt * back(given.p, rate, held_k.rate_x)[0], axis=1)
+            if late_ones:
+                late = late_by(given.p)
+                read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
+                jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0], given))
             off = wrapped(y_k - read)
             errors, variances = [], []
             for j in range(ny):
@@ -298,9 +298,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             following, rate = flow(given, x, u_k)
             if nx <= SMALL:
                 cov = after(cov, jacobian_of(given, at_k.jacobian, (x, following), u_k), half)
-            return (following, cov, u_k[-1], rate), (jnp.stack(errors), jnp.stack(variances))
+            return (following, cov, u_k[-1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
 
-        begin = (start, of_start(spread), u_sub[0, 0], jnp.zeros_like(start))
+        first = moving_rates(start, u_sub[0, 0], given)
+        begin = (start, of_start(spread), u_sub[0, 0], first, no_jumps(ny, start))
         return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
 
     def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
@@ -333,21 +334,6 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return sensors(x, u, p)[0]
 
     return Filter(track, moved, louder, plain_flow, plain_measure, inputs)
-
-
-def product(a: Float[Array, "n k ..."], b: Float[Array, "k m ..."]) -> Float[Array, "n m ..."]:
-    """Product of small matrices at every point: sums that XLA fuses, where it would call a matrix routine per point."""
-    return sum((a[:, j, None] * b[None, j] for j in range(1, a.shape[1])), a[:, 0, None] * b[None, 0])
-
-
-def apart(values: Any) -> Any:
-    """Keep XLA from working values out again in every place that uses them."""
-    return jax.lax.optimization_barrier(values)
-
-
-def along(a: Array, extra: int) -> Array:
-    """Append axes of length one, so that an array is the same at all points."""
-    return a.reshape(*a.shape, *(1,) * extra)
 
 
 def _over_points(function: Callable[..., Array], extra: int) -> Callable[..., Array]:
