@@ -27,6 +27,7 @@ AFTER = {h: {"omega": v} for h, v in (("one_step", 0.03), ("horizon", 0.04), ("f
 EFFECT: dict[str, Any] = {
     "name": "coulomb_friction", "acts_on": "omega", "meaning": "dry friction, the same at every speed",
     "class": ["coulomb_friction"], "class_acts_on": {"coulomb_friction": "omega"}, "same_as": [],
+    "class_members": [{"name": "coulomb_friction", "acts_on": "omega", "same": True}],
     "log_evidence_gain": 193.04, "share_of_residual": 0.98,
     "held_out_gain": {"gain": 31.0, "low": 24.0, "high": 38.0, "unit": "episode", "passed": True},
     "parameters": {"tau_c": {"value": 0.41, "low": 0.4, "high": 0.42, "unit": "rad/s^2"}},
@@ -50,8 +51,9 @@ def verdict(kind: str) -> dict[str, Any]:
     """A verdict of each kind."""
     effects = [EFFECT] if kind in ("effect", "ambiguous") else []
     if kind == "ambiguous":
-        rival = {"class": ["coulomb_friction", "viscous_friction"]}
-        rival["class_acts_on"] = dict.fromkeys(rival["class"], "omega")  # type: ignore[assignment]
+        names = ["coulomb_friction", "viscous_friction"]
+        rival: dict[str, Any] = {"class": names, "class_acts_on": dict.fromkeys(names, "omega")}
+        rival["class_members"] = [{"name": n, "acts_on": "omega", "same": n == names[0]} for n in names]
         effects = [EFFECT | rival]
     return {
         "verdict": kind,

@@ -59,6 +59,14 @@ def test_report(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -
     assert (searches.NEXT["description"] in printed) == (kind == "ambiguous")
 
 
+def test_without_a_report_the_verdict_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = searches.directory(tmp_path, "effect")
+    path = publish(Terminal(False), searches.verdict("effect"), folder, searches.CONFIG | {"report": False})
+    assert path == folder / "verdict.json"
+    assert str(path) in capsys.readouterr().out
+    assert not list(folder.glob("*.html")) + list(folder.glob("*.png"))
+
+
 def test_a_hopeless_fit_has_no_size(tmp_path: Path) -> None:
     """The spread of a fit that never came to rest says nothing about the size of its effect."""
     page = publish(Terminal(True), searches.verdict("none"), searches.directory(tmp_path, "none"), searches.CONFIG)

@@ -174,7 +174,7 @@ def effect_section(found: Mapping[str, Any]) -> Section:
             for name, p in effect["parameters"].items()
         )
         gate = effect.get("held_out_gain")
-        others = [words(n) for n in effect["class"] if n != effect["name"]]
+        others = [f"{words(m['name'])} on {m['acts_on']}" for m in effect["class_members"][1:]]
         rows.append(
             [f"{words(effect['name'])} on {effect['acts_on']}: {effect.get('meaning') or ''}".rstrip(": "), values,
              f"{effect['log_evidence_gain']:.1f} nat",

@@ -21,8 +21,10 @@ KINDS = {
 MOST_NAMED = 6  # effects that were not found, in the terminal
 
 
-def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> None:
+def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: dict[str, Any]) -> Path:
     """Print the verdict, draw the figures, write the report, and say where things lie and what to type next.
+
+    With `report: false` no figure is drawn; the path is then that of the verdict.
 
     Args:
         terminal: to print to.
@@ -32,12 +34,12 @@ def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: 
     """
     show(terminal, found, directory)
     commands = next_commands(found, directory, config)
-    if config.get("report", True):
-        terminal.line(str(_reported(found, directory, config, commands)), "report")
-    else:
-        terminal.line(str(directory / "verdict.json"), "verdict")
+    drawn = config.get("report", True)
+    path = _reported(found, directory, config, commands) if drawn else directory / "verdict.json"
+    terminal.line(str(path), "report" if drawn else "verdict")
     for label, line in zip(["next", *[""] * len(commands)], commands, strict=False):
         terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    return path
 
 
 def _reported(found: dict[str, Any], directory: Path, config: dict[str, Any], commands: list[str]) -> Path:

@@ -102,8 +102,7 @@ def _rivals(found: dict[str, Any], own: dict[str, np.ndarray], accepted: list[in
     """Names that do as well as the accepted one in the final model."""
     for effect in found["effects"]:
         if accepted and effect["name"] == own["effect"][accepted[0]]:
-            places = effect.get("class_acts_on") or {}
-            return {(name, places.get(name, effect["acts_on"])) for name in effect["class"][1:]}
+            return {(m["name"], m["acts_on"]) for m in effect["class_members"][1:]}
     return set()
 
 
