@@ -107,7 +107,7 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     plan = attach()
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
-    selection, gates = _gated(search, assessor, search.run(), terminal)
+    selection, gates, _ = _gated(search, assessor, search.run(), terminal)
     left, gates = _of_two(search, assessor, selection, gates, attach, Discovery(), terminal)
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left

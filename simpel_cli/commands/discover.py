@@ -39,6 +39,7 @@ from simpel_cli.run import Manifest, make_directory, refuse_occupied
 from simulators.effects import Expression, Term
 from simulators.model import Model
 
+MOST_SEARCHES = 3  # each without the effects that did harm in those before
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
@@ -101,8 +102,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     outliers = outlier_check(clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     recording = recording._replace(checks=(*recording.checks, outliers))
-    selection = search.run(base)
-    selection, gates = _gated(search, assessor, selection, terminal)
+    selection, gates = _selected(search, assessor, base, terminal)
     selection, gates = _of_two(search, assessor, selection, gates, attach, options, terminal)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
@@ -187,26 +187,42 @@ def _calibrated(
     return search, base, cut["test"], clean
 
 
+def _selected(search: Search, assessor: Assessor, base: Trial, terminal: Terminal) -> tuple[Selection, list[Gate]]:
+    """Search, and again without an effect with which the errors ahead grow: another one may be what it stood for."""
+    for _ in range(MOST_SEARCHES):
+        selection = search.run(base)
+        selection, gates, harmful = _gated(search, assessor, selection, terminal)
+        if not harmful:
+            break
+        search.banned.update(harmful)
+    return selection, gates
+
+
 def _gated(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
-) -> tuple[Selection, list[Gate]]:
-    """Judge every accepted step on held-out episodes; a step that does not help there ends the list of effects."""
+) -> tuple[Selection, list[Gate], list[int]]:
+    """Judge every accepted step on held-out episodes; a step that does not help there ends the list of effects.
+
+    Returns:
+        what is left of the selection, its gates, and the terms with which the errors ahead grow.
+    """
     gates: list[Gate] = []
     for i, (before, after) in enumerate(zip(selection.path[:-1], selection.path[1:], strict=True)):
         judged = gate(search, assessor, before, after)
         gates.append(judged)
-        added = [search.terms[t].label for t in after.terms if t not in before.terms]
-        _told(" and ".join(added), judged, terminal)
+        added = [t for t in after.terms if t not in before.terms]
+        _told(" and ".join(search.terms[t].label for t in added), judged, terminal)
         if not judged.passed:
             kept = before.terms
             order = [selection.chosen.terms.index(t) for t in kept if t in selection.chosen.terms]
-            return selection._replace(
+            left = selection._replace(
                 chosen=before,
                 path=selection.path[: i + 1],
                 classes=tuple(selection.classes[j] for j in order),
                 gains=tuple(selection.gains[j] for j in order),
-            ), gates[:i]
-    return selection, gates
+            )
+            return left, gates[:i], added if judged.harm else []
+    return selection, gates, []
 
 
 def _of_two(

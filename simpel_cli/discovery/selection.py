@@ -81,6 +81,7 @@ class Search:
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
+        self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
@@ -205,7 +206,8 @@ class Search:
 
     def candidates(self, terms: Sequence[int]) -> list[int]:
         """Terms that can still be added."""
-        return [t for t in range(len(self.terms)) if t not in terms and self.fits((*terms, t))]
+        taken = self.banned.union(terms)
+        return [t for t in range(len(self.terms)) if t not in taken and self.fits((*terms, t))]
 
     def run(self, base: Trial | None = None) -> Selection:
         """Search, from the calibrated simulator if it is known already."""

@@ -8,7 +8,7 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
-from simpel_cli.discovery.setup import key_of
+from simpel_cli.discovery.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.twins import twins
 from simpel_cli.discovery.whiteness import memory
 from simpel_cli.discovery.windows import Windows
@@ -16,6 +16,7 @@ from simulators.effects.expression import per
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
+SHAKEN = 0.05  # of the typical change in a row: process noise that is worth a word
 Z90, Z95 = 1.6448536269514722, 1.959963984540054
 
 
@@ -73,7 +74,11 @@ def verdict_of(
             "horizon_steps": horizon,
         },
         "noise_floor": dict(zip(measured, _noise(search, chosen)[0], strict=True)),
-        "process_noise": {"before": _noise(search, selection.base)[1], "after": _noise(search, chosen)[1]},
+        "process_noise": {
+            "before": _noise(search, selection.base)[1],
+            "after": _noise(search, chosen)[1],
+            "share_after": _shaken(search, chosen),
+        },
         "gate": [g._asdict() for g in gates],
         "not_found": _not_found(search, selection),
         "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
@@ -217,6 +222,16 @@ def _noise(search: Search, trial: Trial) -> tuple[list[float], float]:
     return r, max(q, default=0.0)
 
 
+def _shaken(search: Search, trial: Trial) -> float:
+    """Return the largest process noise in a row over the typical change of its state in a row."""
+    coordinates = search.plan.coordinates
+    n_p, n_r, n_q = coordinates.sizes
+    rows = range(n_p + n_r, n_p + n_r + n_q)
+    return max(
+        (coordinates.value(i, trial.optimum.z[i]) / coordinates.value(i, 1.0) * Q_BOUNDS[1] for i in rows), default=0
+    )
+
+
 def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
     """Return the smallest size of every other effect that would have been seen: it earns ACCEPT nats."""
     last = selection.stages[-1]
@@ -272,7 +287,13 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         case "unexplained":
             return f"The simulator lacks something without a name: {found['remainder']['description']}."
         case _:
-            return "Nothing is missing that these data could show: the calibrated simulator explains them."
+            told = "Nothing is missing that these data could show: the calibrated simulator explains them"
+            if found["process_noise"]["share_after"] < SHAKEN:
+                return f"{told}."
+            return (
+                f"{told} but for what looks like white noise in the rates ({found['process_noise']['after']:.2g} per square "
+                "root of a second): disturbances, or something that changes faster than the rows can show."
+            )
 
 
 def _phrase(effect: dict[str, Any]) -> str:
