@@ -23,12 +23,19 @@ def neighbours(drawn: Set) -> tuple[int, str, tuple[str, ...], int]:
 
 def run(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], workers: int) -> None:
     """Examine sets in few processes; one that dies takes the sets with it that it was at, and no others."""
+    everything = waiting
+    while everything:  # fresh processes now and then; `max_tasks_per_child` can hang (CPython issue 115634)
+        waiting, everything = everything[: SETS_PER_PROCESS * workers], everything[SETS_PER_PROCESS * workers :]
+        _batch(waiting, out, tuned, workers)
+
+
+def _batch(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], workers: int) -> None:
     while waiting:
         context = multiprocessing.get_context("spawn")
         begun = {d.index: out / "begun" / str(d.index) for d in waiting}
         for mark in begun.values():  # of an exam that was interrupted
             mark.unlink(missing_ok=True)
-        with ProcessPoolExecutor(workers, context, max_tasks_per_child=SETS_PER_PROCESS) as pool:
+        with ProcessPoolExecutor(workers, context) as pool:
             futures = {pool.submit(one, d, out, tuned): d for d in waiting}
             for future in as_completed(futures):
                 try:
