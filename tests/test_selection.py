@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
-from simpel_cli.discovery.selection import Trial
+from simpel_cli.discovery.selection import QUIETER, Trial
 from tests.test_twins import searched
 
 
@@ -41,3 +41,24 @@ def test_a_fit_that_is_worse_than_the_model_it_contains_begins_again_beside_it()
     assert fitter.far > 0  # the start of the effect was tried first
     assert trial.optimum.loss == 80.0
     assert isinstance(searched("b").fitter, Fitter)
+
+
+def test_a_candidate_starts_with_noise_that_a_wrong_size_can_hide_in() -> None:
+    search: Any = searched("b")
+    n_p, n_r, n_q = search.plan.coordinates.sizes
+    z = search.plan.start.copy()
+    z[n_p : n_p + n_r + n_q] = 0.0  # a filter that is sure of everything
+    for lane in (*search.lanes((0,), 0, z), search.beside(Trial((), search.base().optimum._replace(z=z)), 0)):
+        r, q = lane.z[n_p : n_p + n_r], lane.z[n_p + n_r : n_p + n_r + n_q]
+        np.testing.assert_array_equal(r, search.plan.start[n_p : n_p + n_r])
+        assert (q >= search.plan.start[n_p + n_r : n_p + n_r + n_q] - QUIETER).all()
+    loud = z.copy()
+    loud[n_p : n_p + n_r + n_q] = 0.95
+    np.testing.assert_array_equal(search.loud(loud), loud)
+
+
+def test_what_did_harm_is_no_candidate() -> None:
+    search: Any = searched("b")
+    first, *others = search.candidates(())
+    search.banned.add(first)
+    assert search.candidates(()) == others
