@@ -16,7 +16,7 @@ from simulators.effects.expression import per
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
-SHAKEN = 0.05  # of the typical change in a row: process noise that is worth a word
+SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
 Z90, Z95 = 1.6448536269514722, 1.959963984540054
 
 
