@@ -65,6 +65,10 @@ def test_errors_that_follow_each_other_are_told_from_white_ones() -> None:
     slow = np.sin(0.3 * np.arange(60))[None] + 0.5 * white
     assert memory(white) is None
     assert memory(-np.diff(white, axis=1)) is None  # of a differentiated column: the next error is opposite
-    assert memory(slow) == pytest.approx(0.6, abs=0.15)
+    assert memory(slow) == (pytest.approx(0.6, abs=0.15), 1)
+    told = memory(np.sin(2.2 * np.arange(60))[None] + 0.8 * white)  # errors of a filter that cannot follow a fast swing
+    assert told is not None
+    assert abs(told[0]) > 0.2
+    assert told[1] > 1
     white[:, ::7] = np.nan
     assert memory(white) is None

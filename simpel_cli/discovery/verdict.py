@@ -184,11 +184,15 @@ def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, An
     """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
     errors = learnt.one_step / np.sqrt(learnt.variance)
     found = {
-        name: r for j, name in enumerate(search.plan.augmented.measured) if (r := memory(errors[:, :, j])) is not None
+        name: told
+        for j, name in enumerate(search.plan.augmented.measured)
+        if (told := memory(errors[:, :, j])) is not None
     }
     if not found:
         return None
-    worst = max(found, key=lambda name: found[name])
+    worst = max(found, key=lambda name: abs(found[name][0]))
+    r, lag = found[worst]
+    apart = "from row to row" if lag == 1 else f"between rows that are {lag} apart"
     model, roles = search.plan.augmented.model, search.plan.augmented.roles
     speed = {position: velocity for velocity, position in roles.velocity.items() if position}
     acts_on = speed.get(worst, worst)
@@ -200,8 +204,8 @@ def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, An
         "unit": unit,
         "log_evidence_gain": None,
         "description": f"something acts on d({acts_on})/dt that is no function of the states and inputs of the model: the "
-        f"one-step errors of {worst} follow each other (correlation {found[worst]:.2f} from row to row); it depends on "
-        "time, or on what was not recorded",
+        f"one-step errors of {worst} have a memory (correlation {r:.2f} {apart}); it depends on time, or on what was not "
+        "recorded",
     }
 
 

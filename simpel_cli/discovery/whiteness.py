@@ -15,6 +15,7 @@ Z95 = 1.959963984540054
 KOLMOGOROV95 = 1.3581  # quantile of the supremum of a Brownian bridge
 LAGS = 20
 MEMORY_NATS, MEMORY_LEAST = 12.0, 0.2  # n r_1^2/2, and r_1, from which on errors are said to follow each other
+SWING_LEAST, SWING_CHANCE = 0.1, 1e-5  # of all r_l^2 together, beyond what chance adds, and the chance of as much
 
 
 class Correlation(NamedTuple):
@@ -84,17 +85,28 @@ def cumulated_periodogram(episodes: Sequence[np.ndarray]) -> Cumulated | None:
     return Cumulated(frequency[order], total / total[-1], KOLMOGOROV95 / np.sqrt(len(frequency)))
 
 
-def memory(errors: np.ndarray) -> float | None:
-    """Return the correlation of each one-step error with the next where it is large and positive, else None.
+def memory(errors: np.ndarray) -> tuple[float, int] | None:
+    """Return the correlation of one-step errors with those some rows before, and how many, where they have one, else None.
 
-    A force that the filter has to follow row after row, since it is no function of states or inputs, leaves such errors;
-    process noise that is white does not.
+    A force that the filter has to follow row after row, since it is no function of states or inputs, leaves errors that
+    follow each other; one that swings with time leaves errors that come again. Process noise that is white does neither.
 
     Args:
         errors: (W, T) standardised, windows by rows.
+
+    Reference: Box and Pierce (1970), Distribution of residual autocorrelations.
     """
-    found = autocorrelation(list(errors), 1)
+    from scipy.stats import chi2
+
+    found = autocorrelation(list(errors))
     if found is None:
         return None
-    n, r = int(np.isfinite(errors).sum()), float(found.value[0])
-    return r if r > MEMORY_LEAST and n * r**2 / 2 > MEMORY_NATS else None
+    n, r = int(np.isfinite(errors).sum()), found.value
+    if r[0] > MEMORY_LEAST and n * r[0] ** 2 / 2 > MEMORY_NATS:
+        return float(r[0]), 1
+    later = r[1:]  # a differentiated column has errors that take back the one before
+    together = float(np.sum(later**2))
+    if together - len(later) / n < SWING_LEAST or chi2.sf(n * together, len(later)) > SWING_CHANCE:
+        return None
+    lag = int(np.argmax(np.abs(later)))
+    return float(later[lag]), lag + 2
