@@ -29,6 +29,7 @@ from simpel_cli.discovery.selection import Search, Selection, Trial
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
+from simpel_cli.discovery.starts import begun
 from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
@@ -174,6 +175,7 @@ def _calibrated(
     """Calibrate the simulator, and again as long as values stand out that it does not have to follow."""
     recording, names = clean.recording, plan.augmented.measured
     cut = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
+    cut = {split: begun(assessor, plan.start, windows) for split, windows in cut.items()}
     told = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):
         search = Search(plan._replace(windows=cut["train"]), fitter.on(cut["train"]), told)

@@ -146,22 +146,35 @@ def key_of(term: Term) -> Key:
 
 
 def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str], outputs: Sequence[str]) -> Scales:
-    """Read the magnitudes of all quantities off the measurements; of what is not measured, off its range."""
+    """Read the magnitudes of all quantities off the measurements; of what is not measured, off its range and the model."""
     states = np.concatenate([e.states for e in episodes])
     inputs = np.concatenate([e.inputs for e in episodes])
     values = np.concatenate([e.outputs for e in episodes])
     size: dict[str, float] = {}
     rate: dict[str, float] = {}
+    declared = _declared_rates(model, states, inputs)
     for i, q in enumerate(model.states):
         known = q.name in measured
         size[q.name] = float(np.nanmax(np.abs(states[:, i]))) if known else max(abs(q.low), abs(q.high))
         steps = np.concatenate([np.diff(e.states[:, i]) for e in episodes]) / model.dt
-        rate[q.name] = max(float(np.nanstd(steps)), 1e-9 * (q.high - q.low)) if known else (q.high - q.low) / 2
+        rate[q.name] = max(float(np.nanstd(steps)) if known else declared[i], 1e-9 * (q.high - q.low))
     for j, q in enumerate(model.inputs):
         size[q.name] = float(np.nanmax(np.abs(inputs[:, j])))
     for k, name in enumerate(outputs):
         size[name] = float(np.nanmax(np.abs(values[:, k])))
     return Scales({k: max(v, 1e-9) for k, v in size.items()}, rate, model.dt)
+
+
+def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Root mean square of the model's rates at what was measured, anything in its range where it was not, (nx,)."""
+    random = np.random.default_rng(0)
+    rows = np.unique(np.linspace(0, len(states) - 1, min(len(states), 500)).astype(int))
+    low, high = (np.array([getattr(q, end) for q in model.states]) for end in ("low", "high"))
+    x = np.where(np.isfinite(states[rows]), states[rows], random.uniform(low, high, (len(rows), len(low))))
+    p = np.array([(q.low + q.high) / 2 for q in model.params])
+    rates = np.asarray(model.function()(x.T, np.nan_to_num(inputs[rows]).T, np.tile(p[:, None], len(rows)))[0])
+    rates = np.where(np.isfinite(rates), rates, np.nan)
+    return np.where(np.isfinite(rates).any(axis=1), np.sqrt(np.nanmean(rates**2, axis=1)), (high - low) / 2)
 
 
 def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str]) -> Windows:

@@ -63,6 +63,7 @@ def movable(augmented: Augmented, of: int, *, slope: bool = False) -> Value:
     in_x, in_u, in_p = (casadi.jacobian(result, v) for v in (x, u, p))
     blocks = _blocks(_places(in_p))
     in_p = casadi.vertcat(*(casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks))
+    own = _finite if slope else lambda v: v
     plain = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([result]), NAMES, ["v"])))
     slopes = casadi.cse([result, in_x, in_u, in_p])
     every = to_jax_rows(casadi.Function("slopes", [x, u, p], slopes, NAMES, ["v", "by_x", "by_u", "by_p"]))
@@ -70,13 +71,13 @@ def movable(augmented: Augmented, of: int, *, slope: bool = False) -> Value:
     @jax.jit
     def all_of(x: Array, u: Array, p: Array) -> tuple[Array, ...]:
         v, *slopes = every(x, u, p)
-        return v, *map(_finite, slopes)
+        return own(v), *map(_finite, slopes)
 
     places_x, places_u = _places(in_x), _places(in_u)
 
     @jax.custom_jvp
     def value(x: Array, u: Array, p: Array, row: Array, moving: Array) -> Array:
-        return plain(x, u, p)[0]
+        return own(plain(x, u, p)[0])
 
     @value.defjvp
     def _(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
