@@ -87,9 +87,8 @@ def setup(
     if any(t.kind == BACKLASH for t in every):
         lead = max(lead, PLAY_ROWS)
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
-    middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     windows = windows_of(
-        recording.train, [q.name for q in model.states], measured, recording.outputs, middle, spread, lead=lead,
+        recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
     if most_rows is not None:
@@ -145,6 +144,11 @@ def key_of(term: Term) -> Key:
     return term.effect, term.acts_on, term.depends_on
 
 
+def centre_of(model: Model) -> np.ndarray:
+    """Guess of states that nothing measures, (nx,): 0 where they have both signs, an empty tank tells no outflow."""
+    return np.array([0.0 if q.low < 0 < q.high else (q.low + q.high) / 2 for q in model.states])
+
+
 def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str], outputs: Sequence[str]) -> Scales:
     """Read the magnitudes of all quantities off the measurements; of what is not measured, off its range and the model."""
     states = np.concatenate([e.states for e in episodes])
@@ -180,9 +184,8 @@ def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.
 def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str]) -> Windows:
     """Cut held-out episodes into windows like those of the search, each as long as its episode."""
     model = plan.augmented.model
-    middle = np.array([0.0 if q.low <= 0 <= q.high else (q.low + q.high) / 2 for q in model.states])
     return windows_of(
-        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, middle, plan.windows.spread[0],
+        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
         lead=plan.lead,
         longest=windows_.LONGEST_TEST,
     )  # fmt: skip

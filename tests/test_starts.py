@@ -1,0 +1,51 @@
+"""Windows begin, in a level that nothing measures, where the measured one says; its rates have the model's scale."""
+
+import numpy as np
+import pytest
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.setup import Setup, setup
+from simpel_cli.discovery.starts import begun
+from simulators.model import Declared
+
+DT, ROWS, EMPTIES, FIRST = 1.0, 40, 0.3, (20.0, 45.0, 70.0, 95.0)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Setup:
+    """Two tanks, of which only the lower one is measured."""
+    random = np.random.default_rng(0)
+    episodes = []
+    for k, first in enumerate(FIRST):
+        h, low = np.array([first, 10.0]), []
+        for _ in range(ROWS):
+            low.append(h[1])
+            for _ in range(20):
+                out = EMPTIES * np.sqrt(np.maximum(h, 0))
+                h = h + DT / 20 * np.array([-out[0], out[0] - out[1]])
+        states = np.stack([np.full(ROWS, np.nan), np.array(low) + 0.02 * random.normal(size=ROWS)], axis=1)
+        episodes.append(Episode(f"{k}", np.arange(ROWS) * DT, states, np.zeros((ROWS, 0)), np.zeros((ROWS, 0))))
+    model = Declared(
+        "tanks", dt=DT, states={n: {"unit": "cm", "range": [0, 120]} for n in ("h_1", "h_2")},
+        parameters={"c": {"unit": "cm^0.5/s", "range": [0.2, 0.45]}},
+        dynamics={"h_1": "-c*sqrt(max(h_1, 0))", "h_2": "c*sqrt(max(h_1, 0)) - c*sqrt(max(h_2, 0))"},
+    ).model()  # fmt: skip
+    data = Recording(tuple(episodes), (), (), {"h_2": 0.02}, ("h_1",), (Check("c", True, ""),), ())
+    return setup(model, data, (), [], 2)
+
+
+def test_a_smoother_puts_the_hidden_level_near_where_it_was(plan: Setup) -> None:
+    before = plan.windows
+    after = begun(Assessor(plan, 5), plan.start, before)
+    truth = np.array(FIRST)[after.episode]
+    whole = after.begin == 0
+    off = [np.abs(w.start[whole, 0] - truth[whole]) for w in (before, after)]
+    assert off[1].mean() < 0.5 * off[0].mean()
+    np.testing.assert_array_equal(after.start[:, 1], before.start[:, 1])  # what is measured stays
+    assert (after.spread[:, 0] <= before.spread[:, 0]).all()
+    assert (after.spread[:, 0] >= 0.15 * before.spread[:, 0]).all()
+
+
+def test_the_rates_of_a_hidden_level_have_the_scale_of_the_model(plan: Setup) -> None:
+    assert 1.0 < plan.scales.rate["h_1"] < 0.325 * np.sqrt(120)  # c sqrt(h), not half of the range per second
