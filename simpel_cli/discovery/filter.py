@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int
 from simpel_cli.discovery.augmented import Augmented
 from simpel_cli.discovery.late_sensors import back, echo, no_jumps, pushed
 from simpel_cli.discovery.points import along, apart, product
-from simpel_cli.discovery.slopes import movable, with_slope
+from simpel_cli.discovery.slopes import Value, movable, with_slope
 from simpel_cli.signals import arriving
 from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
@@ -136,8 +136,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     model = augmented.model
     rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
     moving_rates, moving_sensors = movable(augmented, 0), movable(augmented, 1)
-    bend = movable(augmented, 0, slope=True)
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
+    small = nx <= SMALL  # of a large one the second derivatives are not even made
+    bend = movable(augmented, 0, slope=True) if small else None
     h = dt / substeps
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
@@ -263,7 +264,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         begin = (start, of_start(spread), u_sub[0, 0], *rates(start, u_sub[0, 0], p), no_jumps(ny, start))
         return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
 
-    def jacobian_of(given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
+    def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
         """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
         slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0], u[-1]), strict=True)), jnp.zeros(()))
         change = dt / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
@@ -286,7 +287,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             errors, variances = [], []
             for j in range(ny):
                 c, gain, s = at_k.slope[j], held_k.gain[j], at_k.variance[j]
-                if nx <= SMALL:
+                if small:
                     reach = product(cov, c[:, None])[:, 0]
                     s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
                     gain = (ok_k[j] / s)[None] * reach
@@ -296,8 +297,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 variances.append(s)
                 x = x + gain * e[None]
             following, rate = flow(given, x, u_k)
-            if nx <= SMALL:
-                cov = after(cov, jacobian_of(given, at_k.jacobian, (x, following), u_k), half)
+            if bend is not None:
+                cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), half)
             return (following, cov, u_k[-1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
 
         first = moving_rates(start, u_sub[0, 0], given)
