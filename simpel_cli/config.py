@@ -68,14 +68,16 @@ def launch(
         _refuse_other_runs(overrides)
     register_resolvers()
     known, swept = _top_level(verb), swept_keys(overrides)
+    typed = {word.lstrip("+~").partition("=")[0].partition(".")[0] for word in overrides}
 
     def entry(config: Any) -> Any:
         try:
             hydra_config = HydraConfig.get()
             plain = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-            for key in plain:
-                if key not in known:
+            for key in [k for k in plain if k not in known]:
+                if key not in _of_other_verbs(verb) or key in typed:
                     raise ConfigError(unknown_root(str(key), verb, known))
+                del plain[key]
             folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
             directory = Path(hydra_config.runtime.output_dir)
             if config_dir is not None and "choices" in plain:
@@ -210,6 +212,12 @@ def _group_folder(group: str, choice: str | None, user: Path | None) -> Path:
         if root is not None and choice and (root / group / f"{choice}.yaml").is_file():
             return (root / group / f"{choice}.yaml").parent
     return Path.cwd()
+
+
+def _of_other_verbs(verb: str) -> set[str]:
+    """Groups and keys that an experiment may set for another verb: it serves all of them."""
+    verbs = [path.stem for path in conf_dir().glob("*.yaml")]
+    return {key for other in verbs if other != verb for key in _top_level(other)}
 
 
 def _top_level(verb: str) -> list[str]:

@@ -10,7 +10,7 @@ from simpel_cli.config import conf_dir
 from simpel_cli.discovery import corrected as module
 from simpel_cli.discovery.augmented import augment
 from simpel_cli.discovery.fit import Optimum
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.nodes import build
 from simulators.effects import Scales, Term
 

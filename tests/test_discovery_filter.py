@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.filter import Moving, Noise
 from simpel_cli.discovery.fit import Fitter, Lane
-from simpel_cli.discovery.selection import Search
+from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.selection import select
 from simpel_cli.discovery.setup import Setup, setup
 from simulators.effects import Expression
 from simulators.model import Declared
@@ -233,7 +234,7 @@ def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() ->
     for load in (0.0, 0.5):
         plan = setup(model(), recording(3, load=load), (), [LOAD], 2)
         search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=11))
-        found[load] = search.run()
+        found[load] = select(search)
         if load:
             (term,) = found[load].chosen.terms
             assert search.terms[term].effect == "load"

@@ -7,7 +7,8 @@ from test_discovery_filter import LOAD, A, B, model, recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.exhibits import Exhibit, exhibits
 from simpel_cli.discovery.fit import Fitter, Optimum
-from simpel_cli.discovery.selection import Search, Selection, Stage, Trial
+from simpel_cli.discovery.search import Search, Stage, Trial
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.setup import setup
 from simpel_cli.discovery.setup import test_windows as held_out
 from simulators.effects import Expression

@@ -16,7 +16,8 @@ from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.coordinates import CUT
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.interactions import BASES, carried, names_of
-from simpel_cli.discovery.selection import Search, Selection
+from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.selection import Selection, cut, select
 from simpel_cli.discovery.sensitivity import shifts, waves
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Setup, key_of, setup
@@ -107,7 +108,7 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     plan = attach()
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
-    selection, gates, _ = _gated(search, assessor, search.run(), terminal)
+    selection, gates, _ = _gated(search, assessor, select(search), terminal)
     left, gates = _of_two(search, assessor, selection, gates, attach, Discovery(), terminal)
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left
@@ -138,7 +139,7 @@ def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
     assert found["verdict"] == "effect"
     assert [e["name"] for e in found["effects"]] == ["friction"]
     assert found["remainder"]["depends_on"] == ["s", "v"]
-    without = search.cut(left, ())
+    without = cut(search, left, ())
     assert (without.chosen.terms, without.classes, without.gains) == ((), (), ())
     assert without.base == without.chosen == without.path[-1]
     gain = left.chosen.optimum.log_evidence - without.chosen.optimum.log_evidence

@@ -16,7 +16,8 @@ from simpel_cli.discovery.discriminate import Members, forecast
 from simpel_cli.discovery.episodes import DRIVEN, FREE, Proposal, signal
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.next_experiment import FILE, Class, Designer, class_of, next_experiment
-from simpel_cli.discovery.selection import Search, Selection, Stage
+from simpel_cli.discovery.search import Search, Stage
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.setup import Setup, setup
 from simulators.effects import Expression
 from simulators.model import Declared, Quantity

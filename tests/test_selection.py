@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
-from simpel_cli.discovery.selection import QUIETER, Trial
+from simpel_cli.discovery.search import QUIETER, Trial
 from tests.test_twins import searched
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.fit import Fitter, Optimum
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.discovery.setup import setup
 from simpel_cli.discovery.twins import twins
 from simulators.effects import Expression

@@ -25,7 +25,8 @@ from simpel_cli.discovery.interactions import interaction
 from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
 from simpel_cli.discovery.residual import Forces
-from simpel_cli.discovery.selection import Search, Selection, Trial
+from simpel_cli.discovery.search import Search, Trial
+from simpel_cli.discovery.selection import Selection, cut, select
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
@@ -103,7 +104,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     outliers = outlier_check(clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     recording = recording._replace(checks=(*recording.checks, outliers))
-    selection, gates = _selected(search, assessor, base, terminal)
+    selection, gates = _selected(search, assessor, base, options, terminal)
     selection, gates = _of_two(search, assessor, selection, gates, attach, options, terminal)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
@@ -189,10 +190,12 @@ def _calibrated(
     return search, base, cut["test"], clean
 
 
-def _selected(search: Search, assessor: Assessor, base: Trial, terminal: Terminal) -> tuple[Selection, list[Gate]]:
+def _selected(
+    search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
+) -> tuple[Selection, list[Gate]]:
     """Search, and again without an effect with which the errors ahead grow: another one may be what it stood for."""
     for _ in range(MOST_SEARCHES):
-        selection = search.run(base)
+        selection = select(search, base, options.beginnings)
         selection, gates, harmful = _gated(search, assessor, selection, terminal)
         if not harmful:
             break
@@ -248,7 +251,7 @@ def _of_two(
     gone = [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
     if gone:
         told(f"beside it {' and '.join(gone)} is not needed")
-        selection = search.cut(selection, found.kept)
+        selection = cut(search, selection, found.kept)
         gates = [gates[i] for i in found.kept if i < len(gates)]
     return selection._replace(remainder=(found.term, found.gain)), gates
 

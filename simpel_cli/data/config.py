@@ -23,6 +23,7 @@ class Measurements:
         time: column of the time, s. Without it, a row is one `dt` of the simulator.
         episode: column that names the episode of a row. Without it, the file is one episode.
         columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
+        computed: new column -> formula in columns of the file, e.g. `{v: vx*cos(theta) + vy*sin(theta)}`.
         split: `{column: name}` with the values train and test (other values are left out and counted), or
             `{test_files: [test.csv]}`: these of the files in `path` to test on, the others to train on, or
             `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode. A single
@@ -51,6 +52,7 @@ class Measurements:
     time: str | None = None
     episode: str | None = None
     columns: Mapping[str, str | None] = field(default_factory=dict)
+    computed: Mapping[str, str] = field(default_factory=dict)
     split: Mapping[str, Any] = field(default_factory=lambda: dict(SPLIT_DEFAULT))
     noise_std: Mapping[str, float | int] = field(default_factory=dict)
     resample: float | int | None = None

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli.data import checks, sensor_checks
+from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.files import by_file, locate
 from simpel_cli.data.kinematics import Motion, derived, differences, kinematics
@@ -43,7 +44,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     quantities = (*measurable, *model.inputs)
     config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
     paths = tuple(locate(path, base) for path in config.paths)
-    table = read_table(paths)
+    table = with_computed(read_table(paths), config.computed)
     mapping = map_columns(config, model, table)
     dynamic = bool(model.states) and config.layout == "trajectories"
 

@@ -17,10 +17,12 @@ class Table:
     Args:
         sheets: the files, in the order of `data.path`, with the same columns.
         added: columns of text that stand in none of them, (n,) each.
+        computed: columns of numbers, likewise.
     """
 
     sheets: tuple[Sheet, ...]
     added: dict[str, np.ndarray] = field(default_factory=dict)
+    computed: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return sum(map(len, self.sheets))
@@ -28,7 +30,7 @@ class Table:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns."""
-        return (*self.sheets[0].columns, *self.added)
+        return (*self.sheets[0].columns, *self.added, *self.computed)
 
     @property
     def name(self) -> str:
@@ -52,6 +54,8 @@ class Table:
 
     def numbers(self, name: str) -> np.ndarray:
         """Column as float64, shape (n,), see `Sheet.numbers`."""
+        if name in self.computed:
+            return self.computed[name]
         return np.concatenate([sheet.numbers(name) for sheet in self.sheets])
 
     def labels(self, name: str) -> np.ndarray:

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.discovery.verdict import Z95, interval_of
 from simulators.effects import Term
 from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR

@@ -14,7 +14,8 @@ import numpy as np
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.assess import Assessment, Assessor
 from simpel_cli.discovery.residual import Forces
-from simpel_cli.discovery.selection import Search, Selection
+from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.tables import (
     Columns,
     as_columns,

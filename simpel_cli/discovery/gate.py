@@ -9,7 +9,7 @@ import numpy as np
 
 from simpel_cli.discovery.assess import Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.fit import Lane
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 
 MOST_FOLDS = 5
 

@@ -14,7 +14,7 @@ from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter, Lane
 from simpel_cli.discovery.gate import Gate, gate
 from simpel_cli.discovery.promising import Promise, promised
-from simpel_cli.discovery.selection import ACCEPT, Search, Trial
+from simpel_cli.discovery.search import ACCEPT, Search, Trial
 from simpel_cli.discovery.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 

@@ -21,7 +21,8 @@ import pandas as pd
 from simpel_cli.discovery.discriminate import Forecast, Members, forecast
 from simpel_cli.discovery.episodes import Proposal, neighbours, proposals, reach_of, rows_of, signal
 from simpel_cli.discovery.fit import Lane
-from simpel_cli.discovery.selection import TIE, Search, Selection, Trial
+from simpel_cli.discovery.search import TIE, Search, Trial
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.twins import twins
 from simpel_cli.records import write_text
 

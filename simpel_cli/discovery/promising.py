@@ -22,7 +22,7 @@ from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.augmented import Augmented, augment
 from simpel_cli.discovery.fit import LEAST_CURVATURE
 from simpel_cli.discovery.residual import Forces
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.discovery.sensitivity import shifts, waves
 from simulators.effects import Term
 

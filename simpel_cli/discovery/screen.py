@@ -15,7 +15,7 @@ import numpy as np
 from simpel_cli.discovery.fit import LEAST_CURVATURE, Lane
 
 if TYPE_CHECKING:
-    from simpel_cli.discovery.selection import Search, Trial
+    from simpel_cli.discovery.search import Search, Trial
 
 
 class Score(NamedTuple):

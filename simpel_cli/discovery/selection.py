@@ -1,47 +1,25 @@
-"""Which effects the model lacks: forward and backward selection by evidence, with every known parameter refitted.
+"""Which effects the model lacks: forward and backward selection by evidence.
 
-Held at their old values, the known parameters would leave remainders that look like effects. A named effect has to beat
-every other name and every function without one; names that do as well form a class.
+A named effect has to beat every other name and every function without one; names that do as well form a class. Two effects
+have to beat every single term in place of both.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.screen import promises
-from simpel_cli.discovery.setup import Setup
-from simpel_cli.errors import DataError
+from simpel_cli.discovery.search import ACCEPT, FURTHER, TIE, Search, Stage, Trial, asked
 from simulators.effects import Term
 
-ACCEPT = 4.5  # nats of evidence that an effect must earn
-TIE = 3.0  # nats within which two names are not told apart
-PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
-SHARE = 0.3  # of the largest promise, likewise
-SHARE_OF_OWN = 0.4  # of what the term promises whose place a rival would take
-KEPT = 4  # starts of a stage that are fitted in any case
 MOST_EFFECTS = 8
-ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
-NEARLY = 0.01  # of a knob's range
-QUIETER = 0.1  # of the range of log q, than at the very start
+MOST_MERGERS = 2
+MOST_HOPES = 8  # effects that a search could begin with
+BEGINNINGS = 2  # that it does begin with, beside the one that explains most
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
-STARTS = 6  # of the model as it is
-
-
-class Trial(NamedTuple):
-    """One set of effects and where its fit came to rest."""
-
-    terms: tuple[int, ...]
-    optimum: Optimum
-
-
-class Stage(NamedTuple):
-    """One step of the forward selection: every candidate's fit, best first."""
-
-    before: Trial
-    trials: tuple[Trial, ...]  # each is `before` and one term more
-    screened: tuple[tuple[int, float], ...] = ()  # terms that were not fitted: standard deviation of the amplitude
 
 
 class Selection(NamedTuple):
@@ -69,247 +47,155 @@ class Selection(NamedTuple):
     tried: int
 
 
-class Search:
-    """The search over sets of effects of one setup."""
+class _Grown(NamedTuple):
+    """Where adding effects ended: the fits on the way, what was tried, and an unnamed function still asked for."""
 
-    def __init__(self, plan: Setup, fitter: Fitter, told: Callable[[str], None] = lambda _: None) -> None:
-        self.plan, self.fitter, self.told = plan, fitter, told
-        self.terms = plan.augmented.terms
-        n_p, n_r, n_q = plan.coordinates.sizes
-        self.always = tuple(range(len(plan.augmented.model.params))) + tuple(range(n_p, n_p + n_r + n_q))
-        self.noise = tuple(range(n_p, n_p + n_r + n_q))
-        self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
-        self.ones = np.ones(len(plan.windows.episode))
-        self.tried = 0
-        self.banned: set[int] = set()  # terms that are no candidates
-        self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
+    path: tuple[Trial, ...]
+    stages: tuple[Stage, ...]
+    remainder: tuple[Term, float] | None
 
-    def free(self, terms: Sequence[int]) -> tuple[int, ...]:
-        """Unknowns that move when these terms are there."""
-        return self.always + tuple(row for t in terms for row in self.rows[t])
 
-    def fits(self, terms: Sequence[int]) -> bool:
-        """Whether the compiled program has room for them."""
-        return len(self.free(terms)) <= self.fitter.width
+def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS) -> Selection:
+    """Search, from the calibrated simulator if it is known already.
 
-    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray, weight: np.ndarray | None = None) -> list[Lane]:
-        """Starts of a set of terms of which one is new and begins at each of its start points."""
-        knobs = self.terms[new].knobs
-        lanes = []
-        for s in range(max(len(k.starts) for k in knobs)):
-            start = self.loud(z)
-            for row, knob in zip(self.rows[new], knobs, strict=True):
-                start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
-            lanes.append(Lane(start, self.free(terms), self.ones if weight is None else weight))
-        return lanes
+    Args:
+        search: over the sets of effects of one setup.
+        base: its calibrated simulator.
+        beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
+    """
+    base = base or search.base()
+    search.told("calibrated")
+    grown = _grow(search, (base,))
+    if beginnings and (len(grown.path) > 2 or grown.remainder):
+        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: g.path[-1].optimum.log_evidence)
+    stages, base = grown.stages, grown.path[0]
+    for merger in range(MOST_MERGERS + 1):
+        chosen, gains, without = search.prune(grown.path[-1])
+        whole = _merged(search, chosen)
+        if whole is None or _nameless(search, whole) or merger == MOST_MERGERS:
+            break
+        search.told(f"{search.terms[whole.terms[-1]].label} in place of two")
+        grown = _grow(search, _path(grown.path, whole))
+        stages += grown.stages
+    classes = tuple(search.rivals(chosen, rest) for rest in without)
+    found = Selection(base, chosen, _path(grown.path, chosen), classes, stages, gains, grown.remainder, search.tried)
+    if whole is not None and _nameless(search, whole):
+        return _without(search, found, [i for i, t in enumerate(chosen.terms) if t not in whole.terms], whole)
+    unnamed = [next((t for t in rivals if _nameless(search, t)), None) for rivals in classes]
+    beaten = [i for i, trial in enumerate(unnamed) if trial is not None]
+    if not beaten:
+        return found
+    winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
+    return _without(search, found, beaten, winner)
 
-    def beside(self, before: Trial, new: int) -> Lane:
-        """Start of a model with one term more at the optimum without it, the term all but switched off."""
-        start = self.loud(before.optimum.z)
-        for row in self.rows[new]:
-            start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
-        return Lane(start, self.free((*before.terms, new)), self.ones)
 
-    def loud(self, z: np.ndarray) -> np.ndarray:
-        """Return a start with noise that a step in the wrong direction can hide in.
+def _nameless(search: Search, trial: Trial) -> bool:
+    """Whether the newest term of a trial is a function without a name."""
+    return bool(search.terms[trial.terms[-1]].depends_on)
 
-        With little process noise a size that is off costs thousands of nats, and a fit creeps. And a wrong model follows
-        a sensor as if that had no noise: a better one has to find it again.
-        """
-        z = z.copy()
-        n_p, n_r, n_q = self.plan.coordinates.sizes
-        q, r = np.arange(n_p + n_r, n_p + n_r + n_q), np.arange(n_p, n_p + n_r)
-        z[q] = np.maximum(z[q], self.plan.start[q] - QUIETER)
-        z[r] = np.where(z[r] < NEARLY, self.plan.start[r], z[r])
-        return z
 
-    def off(self, z: np.ndarray, terms: Sequence[int]) -> np.ndarray:
-        """Switch terms off."""
-        z = z.copy()
-        for t in terms:
-            rows = list(self.rows[t])
-            z[rows] = self.plan.start[rows]
-        return z
-
-    def base(self) -> Trial:
-        """Calibrate the simulator as it is, from several starts."""
-        random = np.random.default_rng(0)
-        starts = [self.plan.start]
-        n = len(self.plan.augmented.model.params)
-        for _ in range(STARTS - 1):
-            z = self.plan.start.copy()
-            z[:n] = random.uniform(0.1, 0.9, n)
-            starts.append(z)
-        found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
-        if not any(np.isfinite(o.log_evidence) for o in found):
-            raise DataError(
-                f"sim: no parameters within the ranges of {self.plan.augmented.model.name} gave the measurements a finite "
-                f"likelihood, in {STARTS} tries: its states run away or its rates are not finite. Simulate it from a "
-                "measured start (`simpel simulate`), narrow sim.parameters, or guard roots, logarithms and divisions "
-                "with max(., 1e-9)."
+def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
+    """Add one effect after another to the end of a path, as long as they earn their place."""
+    stages: list[Stage] = []
+    remainder = None
+    while True:
+        current = path[-1]
+        stage = search.add(current, search.candidates(current.terms))
+        trials = stage.trials
+        if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
+            again = search.fitter(
+                [
+                    Lane(search.off(t.optimum.z, t.terms[-1:]), search.free(current.terms), search.ones)
+                    for t in trials[:4]
+                ]
             )
-        return self.best((), found)
-
-    def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:
-        """Return the best of some fits of one set of terms, or an earlier one that was better."""
-        name = frozenset(terms)
-        known = [self.known[name]] if name in self.known else []
-        self.known[name] = max([*found, *known], key=lambda o: o.log_evidence)
-        return Trial(terms, self.known[name])
-
-    def starts(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Lane]]:
-        """Return every start of every candidate."""
-        return [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
-
-    def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING) -> Stage:
-        """Fit `before` with one of the candidates more, each from its promising starts; best first.
-
-        Args:
-            before: the model without it.
-            candidates: terms.
-            least: nats that a start must promise to be fitted.
-        """
-        self.tried += len(candidates)
-        starts = self.starts(before, candidates)
-        scores = promises(self, before, starts)
-        promised = np.array([score.gain for score in scores])
-        order = sorted(range(len(starts)), key=lambda i: -promised[i])
-        finite = promised[np.isfinite(promised)]
-        least = max(least, SHARE * float(finite.max(initial=0.0)))
-        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > least]
-        found = self.fitter([starts[i][1] for i in going])
-        fits: dict[int, list[Optimum]] = {}
-        for i, optimum in zip(going, found, strict=True):
-            fits.setdefault(starts[i][0], []).append(optimum)
-        # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
-        astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
-        for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
-            fits[t].append(optimum)
-        trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
-        left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
-        ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
-        return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
-
-    def best_named(self, trials: Sequence[Trial]) -> Trial | None:
-        """Best trial with a named new effect; a more general name must earn its generality over a simpler one."""
-        named = [t for t in trials if not self.terms[t.terms[-1]].depends_on]
-        if not named:
-            return None
-        best = named[0]
-        own = self.terms[best.terms[-1]]
-        for other in named[1:]:
-            term = self.terms[other.terms[-1]]
-            simpler = term.effect in own.generalises and term.acts_on == own.acts_on
-            if simpler and best.optimum.log_evidence - other.optimum.log_evidence < ACCEPT:
-                best, own = other, term
-        return best
-
-    def candidates(self, terms: Sequence[int]) -> list[int]:
-        """Terms that can still be added."""
-        taken = self.banned.union(terms)
-        return [t for t in range(len(self.terms)) if t not in taken and self.fits((*terms, t))]
-
-    def run(self, base: Trial | None = None) -> Selection:
-        """Search, from the calibrated simulator if it is known already."""
-        current = base = base or self.base()
-        path, stages = [base], []
-        remainder = None
-        self.told("calibrated")
-        while True:
-            stage = self.add(current, self.candidates(current.terms))
-            trials = stage.trials
-            if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
-                again = self.fitter(
-                    [Lane(self.off(t.optimum.z, t.terms[-1:]), self.free(current.terms), self.ones) for t in trials[:4]]
-                )
-                better = self.best(current.terms, again)
-                if better.optimum.log_evidence > current.optimum.log_evidence + 1:
-                    current = better
-                    path[-1] = current
-                    base = current if not current.terms else base
-                    continue
-            stages.append(stage)
-            best = self.best_named(trials)
-            unnamed = next((t for t in trials if self.terms[t.terms[-1]].depends_on), None)
-            gain = best.optimum.log_evidence - current.optimum.log_evidence if best else -np.inf
-            gain_unnamed = unnamed.optimum.log_evidence - current.optimum.log_evidence if unnamed else -np.inf
-            if best is None or not gain > ACCEPT or len(current.terms) == MOST_EFFECTS:
-                if unnamed is not None and gain_unnamed > ACCEPT:
-                    remainder = (self.terms[unnamed.terms[-1]], float(gain_unnamed))
-                break
-            current = best
-            path.append(current)
-            self.told(f"{self.terms[best.terms[-1]].label} +{gain:.0f}")
-        chosen, gains, without = self.prune(current)
-        if chosen.terms != current.terms:
-            path = [t for t in path if set(t.terms) <= set(chosen.terms)]
-            path = path if path[-1].terms == chosen.terms else [*path, chosen]
-        classes = tuple(self.rivals(chosen, rest) for rest in without)
-        found = Selection(base, chosen, tuple(path), classes, tuple(stages), gains, remainder, self.tried)
-        return self.named(found)
-
-    def named(self, found: Selection) -> Selection:
-        """Take out the effects that a function without a name beats; what it depends on is the remainder."""
-        unnamed = [next((t for t in rivals if self.terms[t.terms[-1]].depends_on), None) for rivals in found.classes]
-        beaten = [i for i, trial in enumerate(unnamed) if trial is not None]
-        if not beaten:
-            return found
-        kept = [i for i in range(len(unnamed)) if i not in beaten]
-        left = self.cut(found, kept)
-        winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
-        gain = float(winner.optimum.log_evidence - left.chosen.optimum.log_evidence)
-        return left._replace(remainder=(self.terms[winner.terms[-1]], gain))
-
-    def cut(self, found: Selection, kept: Sequence[int]) -> Selection:
-        """Return what is left of a selection where only the chosen effects at these places are kept."""
-        rest = tuple(found.chosen.terms[i] for i in kept)
-        chosen = self.best(rest, self.fitter(self.less(found.chosen, rest)))
-        path = [t for t in found.path if set(t.terms) <= set(rest)]
-        path = path if set(path[-1].terms) == set(rest) else [*path, chosen]
-        return found._replace(
-            base=found.base if rest else chosen,
-            chosen=chosen,
-            path=(*path[:-1], chosen),
-            classes=tuple(found.classes[i] for i in kept),
-            gains=tuple(found.gains[i] for i in kept),
+            better = search.best(current.terms, again)
+            if better.optimum.log_evidence > current.optimum.log_evidence + 1:
+                path = (*path[:-1], better)
+                continue
+        stages.append(stage)
+        best = search.best_named(trials)
+        unnamed = next((t for t in trials if search.terms[t.terms[-1]].depends_on), None)
+        gain, gain_unnamed = (
+            t.optimum.log_evidence - current.optimum.log_evidence if t else -np.inf for t in (best, unnamed)
         )
+        if best is None or not gain > asked(len(current.terms) + 1) or len(current.terms) == MOST_EFFECTS:
+            if unnamed is not None and gain_unnamed > ACCEPT:
+                remainder = (search.terms[unnamed.terms[-1]], float(gain_unnamed))
+            return _Grown(path, tuple(stages), remainder)
+        path = (*path, best)
+        search.told(f"{search.terms[best.terms[-1]].label} +{gain:.0f}")
 
-    def less(self, current: Trial, rest: tuple[int, ...]) -> list[Lane]:
-        """Starts of a set of terms that has fewer than the current one."""
-        z = self.off(current.optimum.z, tuple(t for t in current.terms if t not in rest))
-        n_p, n_r, n_q = self.plan.coordinates.sizes
-        loud = z.copy()  # the noise that the terms explained has to go somewhere
-        loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
-        return [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
 
-    def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
-        """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""
-        while current.terms:
-            without = self.without(current)
-            gains = [current.optimum.log_evidence - t.optimum.log_evidence for t in without]
-            weakest = int(np.argmin(gains))
-            if gains[weakest] >= ACCEPT:
-                return current, tuple(gains), without
-            current = without[weakest]
-        return current, (), []
+def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
+    """Yield where the search ends that begins with another effect.
 
-    def without(self, current: Trial) -> list[Trial]:
-        """Fit every set that lacks one of the terms."""
-        sets = [tuple(t for t in current.terms if t != gone) for gone in current.terms]
-        lanes = [lane for rest in sets for lane in self.less(current, rest)]
-        found = self.fitter(lanes)
-        return [self.best(rest, found[2 * i : 2 * i + 2]) for i, rest in enumerate(sets)]
+    What first explains most is not always there: it may stand for a part of two others.
+    """
+    first = grown.stages[0]
+    begun = grown.path[1:2]
+    named = [t for t in first.trials if not _nameless(search, t) and all(t.terms != b.terms for b in begun)]
+    least = first.before.optimum.log_evidence
+    seen = [(t.optimum.log_evidence, _hope(search, t)) for t in begun]
+    tried = 0
+    hopes = [(t, _hope(search, t)) for t in named[:MOST_HOPES] if t.optimum.log_evidence > least + ACCEPT]
+    for trial, hope in sorted(hopes, key=lambda found: -found[0].optimum.log_evidence - found[1]):
+        here = trial.optimum.log_evidence, hope
+        if tried == most or any(np.allclose(here, there, rtol=0, atol=TIE / 2) for there in seen):
+            continue
+        seen.append(here)
+        tried += 1
+        search.told(f"beginning with {search.terms[trial.terms[-1]].label}")
+        other = _grow(search, (grown.path[0], trial))
+        yield other._replace(stages=(first, *other.stages))
 
-    def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
-        """Return the trials in which another name takes the place of the term that `rest` lacks, and does as well."""
-        (own,) = set(chosen.terms) - set(rest.terms)
-        own_scores = [s.gain for s in promises(self, rest, self.starts(rest, [own])) if np.isfinite(s.gain)]
-        least = max(PROMISING, SHARE_OF_OWN * max(own_scores, default=0.0))
-        trials = self.add(rest, [t for t in self.candidates(rest.terms) if t != own], least).trials
-        top, own_effect = chosen.optimum.log_evidence, self.terms[own].effect
-        return tuple(
-            t
-            for t in trials
-            if t.optimum.log_evidence >= top + (ACCEPT if self.terms[t.terms[-1]].depends_on else -TIE)
-            and own_effect not in self.terms[t.terms[-1]].generalises
-        )
+
+def _hope(search: Search, trial: Trial) -> float:
+    """Return what the best next effect promises beside a trial's, nats."""
+    named = [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on]
+    gains = [score.gain for score in promises(search, trial, search.starts(trial, named))]
+    return max((g for g in gains if np.isfinite(g)), default=0.0)
+
+
+def _merged(search: Search, chosen: Trial) -> Trial | None:
+    """Return the best model with one term in place of two of the chosen, where it does as well; None: there is none.
+
+    An input that arrives late makes two sensors seem late, and one function of the input two faults of it.
+    """
+    most, best = chosen.optimum.log_evidence, None
+    for pair in combinations(chosen.terms, 2):
+        less = tuple(t for t in chosen.terms if t not in pair)
+        rest = search.best(less, search.fitter(search.less(chosen, less)))
+        trials = search.add(rest, [t for t in search.candidates(rest.terms) if t not in pair]).trials
+        named = search.best_named(trials)
+        for trial in [*([named] if named else []), *(t for t in trials[:1] if _nameless(search, t))]:
+            worth = trial.optimum.log_evidence + (0.0 if _nameless(search, trial) else FURTHER)
+            if worth > most:
+                most, best = worth, trial
+    return best
+
+
+def _path(path: Sequence[Trial], chosen: Trial) -> tuple[Trial, ...]:
+    """Return the part of a path that leads to a set of effects, with that set at its end."""
+    left = [t for t in path if set(t.terms) < set(chosen.terms)]
+    return (*left, chosen) if chosen.terms else (chosen,)
+
+
+def _without(search: Search, found: Selection, beaten: Sequence[int], winner: Trial) -> Selection:
+    """Take out the effects that a function without a name beats; what it depends on is the remainder."""
+    left = cut(search, found, [i for i in range(len(found.chosen.terms)) if i not in beaten])
+    gain = float(winner.optimum.log_evidence - left.chosen.optimum.log_evidence)
+    return left._replace(remainder=(search.terms[winner.terms[-1]], gain))
+
+
+def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
+    """Return what is left of a selection where only the chosen effects at these places are kept."""
+    rest = tuple(found.chosen.terms[i] for i in kept)
+    chosen = search.best(rest, search.fitter(search.less(found.chosen, rest)))
+    return found._replace(
+        base=found.base if rest else chosen,
+        chosen=chosen,
+        path=_path(found.path, chosen),
+        classes=tuple(found.classes[i] for i in kept),
+        gains=tuple(found.gains[i] for i in kept),
+    )

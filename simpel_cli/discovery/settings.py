@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from simpel_cli.discovery.selection import BEGINNINGS
 from simpel_cli.errors import ConfigError
 
 PAIR = 11  # unknowns of a function of two arguments beside an effect
@@ -19,6 +20,7 @@ class Discovery:
         rows: training rows that a search looks at, evenly spaced windows of a longer record; errors are of all test rows.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
             Without it, they are looked for in what is left at the end.
+        beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
     """
 
     horizon: int = 20
@@ -27,6 +29,7 @@ class Discovery:
     room: int = 9
     rows: int = 3000
     pairs: bool = False
+    beginnings: int = BEGINNINGS
 
     def __post_init__(self) -> None:
         if self.pairs and self.room < PAIR:
@@ -36,5 +39,7 @@ class Discovery:
         for name in ("horizon", "lanes", "room", "rows"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"discovery.{name}: got {getattr(self, name)}; it must be at least 1.")
+        if self.beginnings < 0:
+            raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")
         if self.substeps is not None and self.substeps < 1:
             raise ConfigError(f"discovery.substeps: got {self.substeps}; it must be at least 1.")

@@ -8,7 +8,8 @@ import numpy as np
 from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.assess import SETTLE, Assessment
 from simpel_cli.discovery.residual import Force
-from simpel_cli.discovery.selection import Search, Selection
+from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.verdict import interval_of
 from simpel_cli.discovery.windows import Windows
 

@@ -6,7 +6,7 @@ not where it does not: so the model decides, not a list.
 
 import numpy as np
 
-from simpel_cli.discovery.selection import Search, Trial
+from simpel_cli.discovery.search import Search, Trial
 from simulators.effects.term import OPERATORS, SENSOR
 
 POINTS = 64

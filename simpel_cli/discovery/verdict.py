@@ -7,7 +7,8 @@ import numpy as np
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
-from simpel_cli.discovery.selection import ACCEPT, Search, Selection, Trial
+from simpel_cli.discovery.search import Search, Trial, asked
+from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.twins import twins
 from simpel_cli.discovery.whiteness import memory
@@ -237,7 +238,7 @@ def _shaken(search: Search, trial: Trial) -> float:
 
 
 def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
-    """Return the smallest size of every other effect that would have been seen: it earns ACCEPT nats."""
+    """Return the smallest size of every other effect that would have been seen: it earns what one more effect is asked."""
     last = selection.stages[-1]
     if last.before.terms != selection.chosen.terms:
         return []
@@ -251,7 +252,7 @@ def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
     for t, sd, earned in seen:
         term, row = search.terms[t], search.rows[t][0]
         occam = max(-np.log(sd * np.sqrt(2 * np.pi)), 0.0)
-        size = sd * np.sqrt(2 * (ACCEPT + occam))
+        size = sd * np.sqrt(2 * (asked(len(selection.chosen.terms) + 1) + occam))
         span = search.plan.coordinates.high[row] - search.plan.coordinates.low[row]
         if size < 1 and not term.depends_on:
             knob = term.knobs[0]

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.discovery.search import ACCEPT, TIE, asked
 from simpel_cli.plots.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
 
-ACCEPT, TIE = 4.5, 3.0  # nats: what an effect must earn, and within which two are not told apart
 LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge
 LINEAR = 10.0  # nats up to which the axis is linear; logarithmic beyond
 MOST_BARS = 11
@@ -25,7 +25,7 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
     figure, axes = new_figure(len(steps), 9.4 / columns, 0.9 + 0.235 * MOST_BARS, columns=columns)
     for axis, step in zip(axes, steps, strict=True):
         own = {name: column[table["step"] == step] for name, column in table.items()}
-        _bars(axis, own, found)
+        _bars(axis, own, found, asked(1 + steps.index(step)))
         best = np.flatnonzero(own["accepted"]).tolist()
         what = f"+ {_label(own, best[0])}" if len(best) else "nothing more is accepted"
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
@@ -42,7 +42,14 @@ def _legend(figure: Any) -> None:
         Patch(color=TIED, label="as good in the final model"),
         Patch(color=OTHER, label="others"),
         Patch(**NAMELESS, label="a function without a name"),
-        Line2D([], [], color=COLOURS[2], linestyle="--", linewidth=1, label=f"{ACCEPT:g} nat, to be earned"),
+        Line2D(
+            [],
+            [],
+            color=COLOURS[2],
+            linestyle="--",
+            linewidth=1,
+            label=f"to be earned: {ACCEPT:g} nat, more in later steps",
+        ),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
 
@@ -53,7 +60,7 @@ def _label(own: dict[str, np.ndarray], i: int) -> str:
     return f"{own['effect'][i]} on {own['acts_on'][i]}".replace("_", " ")
 
 
-def _bars(axis: Any, own: dict[str, np.ndarray], found: dict[str, Any]) -> None:
+def _bars(axis: Any, own: dict[str, np.ndarray], found: dict[str, Any], least: float) -> None:
     gain = own["log_evidence_gain"]
     finite = [i for i in np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable").tolist() if np.isfinite(gain[i])]
     accepted = [i for i in finite if own["accepted"][i]]
@@ -62,7 +69,7 @@ def _bars(axis: Any, own: dict[str, np.ndarray], found: dict[str, Any]) -> None:
         shown = [*shown[:-1], accepted[0]]
     rivals = _rivals(found, own, accepted)
     values = gain[shown]
-    high = max(float(values.max(initial=0.0)), 3 * ACCEPT)
+    high = max(float(values.max(initial=0.0)), 3 * least)
     axis.set_xscale("symlog", linthresh=LINEAR, linscale=0.8)
     axis.set_xlim(LOWEST, 6 * high if high > LINEAR else 1.6 * high)
     ticks = [-10.0, 0.0] + [float(10**n) for n in range(1, 7) if 10**n <= 2 * high]
@@ -83,7 +90,7 @@ def _bars(axis: Any, own: dict[str, np.ndarray], found: dict[str, Any]) -> None:
         tick.set_fontweight("bold" if i in accepted else "normal")
     axis.set_ylim(len(shown) - 0.4, -0.6)
     axis.axvline(0, color="0.4", linewidth=0.8)
-    axis.axvline(ACCEPT, color=COLOURS[2], linewidth=1, linestyle="--")
+    axis.axvline(least, color=COLOURS[2], linewidth=1, linestyle="--")
     axis.set_xlabel("gain in log evidence [nat]", fontsize=8)
     axis.grid(visible=False, axis="y")
     _bracket(axis, own, shown, accepted)

@@ -71,7 +71,7 @@ def _grade(effect: Mapping[str, Any], planted: Mapping[str, Any], gains: Gains) 
         return TWIN
     special = (NESTED.get(planted["name"], ""), planted["acts_on"])
     true = gains.get((planted["name"], planted["acts_on"]), -np.inf)
-    if names == [special] and true - gains.get(special, np.inf) < ACCEPT:
+    if special in names and true - gains.get(special, np.inf) < ACCEPT:
         return TIE
     return WRONG
 
