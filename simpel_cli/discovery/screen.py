@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.fit import LEAST_CURVATURE, Lane
+from simulators.effects.term import DELAY
 
 if TYPE_CHECKING:
     from simpel_cli.discovery.search import Search, Trial
@@ -45,8 +46,8 @@ def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane
     known = search.free(before.terms)
     room = search.fitter.width - len(known)
     groups: list[list[int]] = []
-    for i, (term, _) in enumerate(starts):
-        if not any(k.neutral == 0 for k in search.terms[term].knobs):
+    for i, (term, lane) in enumerate(starts):
+        if not any(k.neutral == 0 for k in search.terms[term].knobs) or _late(search, term, lane):
             continue
         size = len(search.rows[term])
         for group in groups:
@@ -73,6 +74,12 @@ def promises(search: "Search", before: "Trial", starts: Sequence[tuple[int, Lane
             ]
             found[i] = _promise(optimum.gradient, optimum.fisher, rows, len(known), optimum.z[list(optimum.free)])
     return found
+
+
+def _late(search: "Search", term: int, lane: Lane) -> bool:
+    """Whether a term begins as a delay of more than a row: a slope at none tells nothing of that."""
+    row, plan = search.rows[term][0], search.plan
+    return search.terms[term].kind == DELAY and plan.coordinates.value(row, lane.z[row]) > plan.augmented.model.dt
 
 
 def _promise(gradient: np.ndarray, fisher: np.ndarray, rows: list[int], known: int, at: np.ndarray) -> Score:
