@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
-from simpel_cli.discovery.search import QUIETER, Trial
+from simpel_cli.discovery.search import ACCEPT, QUIETER, Trial, asked
+from simpel_cli.discovery.selection import select
+from simulators.effects import Expression
 from tests.test_twins import searched
 
 
@@ -62,3 +64,62 @@ def test_what_did_harm_is_no_candidate() -> None:
     first, *others = search.candidates(())
     search.banned.add(first)
     assert search.candidates(()) == others
+
+
+def force(name: str) -> Expression:
+    return Expression(name, acts_on="v", term="k*v", parameters={"k": {"range": [-1, 1], "unit": "1/T"}})
+
+
+class Table:
+    """Fits whose evidence stands in a table of sets of names; a set that is not there is a nat worse than its best part."""
+
+    width = 12
+
+    def __init__(self, evidence: dict[str, float]) -> None:
+        self.search: Any = searched("b", [force(name) for name in "ABCDE"])
+        self.search.fitter = self
+        self.evidence = {frozenset(names): value for names, value in evidence.items()}
+        self.search.banned = {i for i, term in enumerate(self.search.terms) if term.depends_on}
+
+    def of(self, names: frozenset[str]) -> float:
+        if names in self.evidence:
+            return self.evidence[names]
+        return max(self.of(names - {name}) for name in names) - 1
+
+    def __call__(self, lanes: Sequence[Lane], most: int = 0) -> list[Optimum]:
+        found = []
+        for lane in lanes:
+            on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(lane.free)}
+            value = float(self.of(frozenset(self.search.terms[i].effect for i in on)))
+            d, eye = len(lane.free), np.eye(len(lane.free))
+            slope = np.full(d, 100.0)  # everything promises the same, and enough to be fitted
+            found.append(Optimum(lane.z, lane.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True))
+        return found
+
+    def chosen(self, **options: int) -> str:
+        found = select(self.search, **options)
+        assert [t.terms for t in found.path][-1] == found.chosen.terms
+        assert len(found.classes) == len(found.gains) == len(found.chosen.terms)
+        return "".join(sorted(self.search.terms[t].effect for t in found.chosen.terms))
+
+
+def test_every_further_effect_has_to_earn_more() -> None:
+    assert asked(1) == ACCEPT < asked(2) < asked(3)
+    enough = asked(2) + 0.1
+    assert Table({"": 0, "A": 30, "AB": 30 + enough}).chosen() == "AB"
+    assert Table({"": 0, "A": 30, "AB": 30 + ACCEPT + 0.1}).chosen() == "A"
+    assert Table({"": 0, "A": ACCEPT + 0.1}).chosen() == "A"
+
+
+def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
+    gains = {"": 0.0, "A": 20.0, "E": 15.0, "D": 14.0, "AB": 40.0, "AD": 35.0, "ABD": 61.0}
+    assert Table(gains).chosen() == "ABD"
+    assert Table(gains | {"DE": 60.0}).chosen(beginnings=0) == "DE"
+    assert Table(gains | {"DE": 55.0}).chosen(beginnings=0) == "ABD"
+
+
+def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None:
+    gains = {"": 0.0, "A": 30.0, "AD": 41.0, "B": 25.0, "BC": 80.0}
+    assert Table(gains).chosen() == "BC"
+    assert Table(gains).chosen(beginnings=0) == "AD"
+    assert Table({"": 0.0, "A": 30.0, "B": 25.0, "BC": 80.0}).chosen() == "A"  # one was enough: nothing was left

@@ -1,5 +1,6 @@
 """Two names of one function: told by the model, not by a list."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ EFFECTS = [
 ]
 
 
-def searched(gain: str) -> Search:
+def searched(gain: str, effects: Sequence[Expression] = EFFECTS) -> Search:
     model = Declared(
         "lane", dt=0.1,
         states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-3, 3]}},
@@ -36,7 +37,7 @@ def searched(gain: str) -> Search:
         for k in range(4)
     )
     recording = Recording(episodes[:3], episodes[3:], (), {"s": 0.1, "v": 0.1}, (), (Check("c", True, ""),), ())
-    plan = setup(model, recording, (), EFFECTS, 1)
+    plan = setup(model, recording, (), effects, 1)
     return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=1, width=12))
 
 

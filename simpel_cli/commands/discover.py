@@ -187,6 +187,7 @@ def _calibrated(
         cut = after
         if same:
             break
+    told("calibrated")
     return search, base, cut["test"], clean
 
 

@@ -64,7 +64,6 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
     """
     base = base or search.base()
-    search.told("calibrated")
     grown = _grow(search, (base,))
     if beginnings and (len(grown.path) > 2 or grown.remainder):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: g.path[-1].optimum.log_evidence)
