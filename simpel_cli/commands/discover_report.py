@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.discovery.search import ACCEPT, FURTHER
 from simpel_cli.plots import draw_discover
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import figure
@@ -188,7 +189,8 @@ def effect_section(found: Mapping[str, Any]) -> Section:
         "head": ["effect", "size (90 %)", "evidence", "held-out gain (95 %)", "as good as it"],
         "rows": rows,
         "text": True,
-        "note": "Evidence: what the model loses without the effect, everything else fitted anew; 4.5 nat are asked for. "
+        "note": "Evidence: what the model loses without the effect, everything else fitted anew; "
+        f"{ACCEPT:g} nat are asked of one effect, {FURTHER:g} more of each for every further one. "
         "Held-out gain: log likelihood of training episodes that the parameters were not fitted to.",
     }
 
