@@ -215,18 +215,22 @@ def _group_folder(group: str, choice: str | None, user: Path | None) -> Path:
 
 
 def _of_other_verbs(verb: str) -> set[str]:
-    """Groups and keys that an experiment may set for another verb: it serves all of them."""
+    """Groups and keys that an experiment may set for another verb that takes experiments: it serves all of them."""
     verbs = [path.stem for path in conf_dir().glob("*.yaml")]
-    return {key for other in verbs if other != verb for key in _top_level(other)}
+    entries = {other: _entries(other) for other in verbs if other != verb}
+    return {key for keys in entries.values() if "experiment" in keys for key in keys}
 
 
 def _top_level(verb: str) -> list[str]:
     """Groups and keys of a root configuration and of those that it builds on."""
+    return [name for name in _entries(verb) if name != "experiment"]
+
+
+def _entries(verb: str) -> list[str]:
     import yaml
 
     root = yaml.safe_load((conf_dir() / f"{verb}.yaml").read_text())
     entries = root.get("defaults", [])
-    inherited = [name for e in entries if isinstance(e, str) and e != "_self_" for name in _top_level(e)]
+    inherited = [name for e in entries if isinstance(e, str) and e != "_self_" for name in _entries(e)]
     groups = [name for name in (next(iter(d)) for d in entries if isinstance(d, dict)) if "/" not in name]
-    own = [k for k in root if k not in ("defaults", "hydra")]
-    return list(dict.fromkeys([*inherited, *(g for g in groups if g != "experiment"), *own]))
+    return list(dict.fromkeys([*inherited, *groups, *(k for k in root if k not in ("defaults", "hydra"))]))

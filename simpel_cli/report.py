@@ -22,7 +22,8 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { padding: .25rem .9rem .25rem 0; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap }
 th:first-child, td:first-child { text-align: left } td.text { white-space: normal; text-align: left }
 code, pre { background: #f4f4f2; padding: .1rem .3rem; border-radius: 3px; font-size: .85rem }
-pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } .warn { color: #a33 } .interval { color: #777; font-size: .85em }
+pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere }
+.warn { color: #a33 } .interval { color: #777; font-size: .85em }
 @media print { body { margin: 0; max-width: none } h2 { break-after: avoid } img, table { break-inside: avoid } }
 </style></head><body>
 <h1>{{ title }}</h1><p class="{{ "sentence" if opening else "lead" }}">{{ opening or lead }}</p>

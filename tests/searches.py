@@ -193,7 +193,7 @@ def tables(folder: Path, both: bool) -> None:
         {
             "step": [s for s, *_ in steps], "effect": [e for _, e, *_ in steps], "acts_on": ["omega"] * len(steps),
             "depends_on": [d for _, _, d, *_ in steps], "log_evidence_gain": [g for *_, g, _ in steps],
-            "accepted": [a for *_, a in steps],
+            "accepted": [a for *_, a in steps], "asked": [4.5 if s == 1 else 6.8 for s, *_ in steps],
         },
     )  # fmt: skip
     write_table(

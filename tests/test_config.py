@@ -67,6 +67,20 @@ def test_every_experiment_composes_and_builds(experiment: str, tmp_path: Path) -
             build(config[group], group, default=DEFAULTS.get(group))
 
 
+def test_an_experiment_serves_every_verb(tmp_path: Path) -> None:
+    (tmp_path / "my" / "experiment").mkdir(parents=True)
+    text = "# @package _global_\nrun: {name: mine}\nclose: false\ndiscovery: {rows: 7}\n"
+    (tmp_path / "my" / "experiment" / "mine.yaml").write_text(text)
+    words = ("--config-dir", "my", "experiment=mine")
+    searched = compose(tmp_path, "discover", *words)
+    assert (searched["close"], searched["discovery"]["rows"]) == (False, 7)
+    assert compose(tmp_path, "discover", *words, "close=true")["close"] is True
+    result = simpel(tmp_path, "fit", *words, "data.n_train=0")  # that far and no further: its own mistake is told
+    assert "data.n_train" in result.err
+    result = simpel(tmp_path, "fit", *words, "+discovery.lanes=3")
+    assert "discovery: no such key or group of `simpel fit`" in result.err
+
+
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda p: str(p.relative_to(CONF)))
 def test_every_yaml_says_what_it_is(path: Path) -> None:
     assert path.read_text().startswith("# "), "the first line is a comment that says what the file is"

@@ -14,7 +14,8 @@ from simulators.effects import Expression, Scales, Term, structure, unnamed
 from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR
 from simulators.model import Declared, Model, ModelError
 
-NAMES = sorted(p.stem for p in (conf_dir() / "effect").glob("*.yaml") if p.stem != "all")
+LISTS = ("all", "vehicle")
+NAMES = sorted(p.stem for p in (conf_dir() / "effect").glob("*.yaml") if p.stem not in LISTS)
 
 
 def catalogue(name: str) -> Expression:

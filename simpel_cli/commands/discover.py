@@ -194,13 +194,13 @@ def _calibrated(
 def _selected(
     search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
 ) -> tuple[Selection, list[Gate]]:
-    """Search, and again without an effect with which the errors ahead grow: another one may be what it stood for."""
+    """Search, and again without an effect that the gate refused: another one may be what it stood for."""
     for _ in range(MOST_SEARCHES):
         selection = select(search, base, options.beginnings)
-        selection, gates, harmful = _gated(search, assessor, selection, terminal)
-        if not harmful:
+        selection, gates, refused = _gated(search, assessor, selection, terminal)
+        if not refused:
             break
-        search.banned.update(harmful)
+        search.banned.update(refused)
     return selection, gates
 
 
@@ -210,7 +210,8 @@ def _gated(
     """Judge every accepted step on held-out episodes; a step that does not help there ends the list of effects.
 
     Returns:
-        what is left of the selection, its gates, and the terms with which the errors ahead grow.
+        what is left of the selection, its gates, and the terms to search without: with them the errors ahead grow, or
+        they are not certain and others, which they kept from being judged, had been found after them.
     """
     gates: list[Gate] = []
     for i, (before, after) in enumerate(zip(selection.path[:-1], selection.path[1:], strict=True)):
@@ -227,7 +228,7 @@ def _gated(
                 classes=tuple(selection.classes[j] for j in order),
                 gains=tuple(selection.gains[j] for j in order),
             )
-            return left, gates[:i], added if judged.harm else []
+            return left, gates[:i], added if judged.harm or i + 2 < len(selection.path) else []
     return selection, gates, []
 
 

@@ -27,16 +27,18 @@ def with_computed(table: Table, formulas: Mapping[str, str]) -> Table:
         if name in table.columns:
             raise ConfigError(f"{key}: {table.name} has a column of this name already. Give the new one another name.")
         try:
-            names = sorted(symbols_used(str(formula)))
+            names = sorted(symbols_used(formula))
             lacking = [n for n in names if n not in table.columns]
             if lacking:
                 raise table.missing(lacking[0], f"{key} uses it: {formula}")
             symbols = {n: casadi.SX.sym(n) for n in names}
-            rule = casadi.Function("rule", list(symbols.values()), [parse(str(formula), symbols)])
+            rule = casadi.Function("rule", list(symbols.values()), [parse(formula, symbols)])
         except ExpressionError as error:
             raise ConfigError(f"{key}: {error}") from error
         if not names:
             raise ConfigError(f"{key}: {formula!r} uses no column. Name those that it is made of.")
-        values = np.asarray(rule.map(len(table))(*(table.numbers(n)[None, :] for n in names)))[0]
+        columns = np.array([table.numbers(n) for n in names])
+        values = np.asarray(rule.map(len(table))(*columns[:, None, :]))[0]
+        values[np.isnan(columns).any(axis=0)] = np.nan  # max(nan, 0) is 0 to CasADi
         table = replace(table, computed=table.computed | {name: values})
     return table

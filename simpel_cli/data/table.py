@@ -60,6 +60,8 @@ class Table:
 
     def labels(self, name: str) -> np.ndarray:
         """Column as text, shape (n,), see `Sheet.labels`."""
+        if name in self.computed:
+            return np.array(["" if np.isnan(v) else f"{v:.12g}" for v in self.computed[name]])
         return self.added[name] if name in self.added else np.concatenate([s.labels(name) for s in self.sheets])
 
     def place(self, index: int) -> str:

@@ -114,7 +114,7 @@ def exhibits(
         ),
         "errors": Exhibit(error_columns(before, after, windows, measured, noise), {}),
         "parameters": Exhibit(parameter_columns(search, selection), {}),
-        "candidates": Exhibit(candidate_columns(search, selection), {"log_evidence_gain": "nat"}),
+        "candidates": Exhibit(candidate_columns(search, selection), {"log_evidence_gain": "nat", "asked": "nat"}),
         "coverage": Exhibit(_coverage(search, recording), {}),
     }  # fmt: skip
 

@@ -72,7 +72,7 @@ class Search:
         """Whether the compiled program has room for them."""
         return len(self.free(terms)) <= self.fitter.width
 
-    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray, weight: np.ndarray | None = None) -> list[Lane]:
+    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Lane]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""
         knobs = self.terms[new].knobs
         lanes = []
@@ -80,7 +80,7 @@ class Search:
             start = self.loud(z)
             for row, knob in zip(self.rows[new], knobs, strict=True):
                 start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
-            lanes.append(Lane(start, self.free(terms), self.ones if weight is None else weight))
+            lanes.append(Lane(start, self.free(terms), self.ones))
         return lanes
 
     def beside(self, before: Trial, new: int) -> Lane:
@@ -170,8 +170,13 @@ class Search:
         ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
         return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
 
-    def best_named(self, trials: Sequence[Trial]) -> Trial | None:
-        """Best trial with a named new effect; a more general name must earn its generality over a simpler one."""
+    def best_named(self, trials: Sequence[Trial], least: float = -np.inf) -> Trial | None:
+        """Best trial with a named new effect; a more general name must earn its generality over a simpler one.
+
+        Args:
+            trials: best first.
+            least: evidence that the simpler one must reach.
+        """
         named = [t for t in trials if not self.terms[t.terms[-1]].depends_on]
         if not named:
             return None
@@ -180,7 +185,8 @@ class Search:
         for other in named[1:]:
             term = self.terms[other.terms[-1]]
             simpler = term.effect in own.generalises and term.acts_on == own.acts_on
-            if simpler and best.optimum.log_evidence - other.optimum.log_evidence < ACCEPT:
+            value = other.optimum.log_evidence
+            if simpler and value > least and best.optimum.log_evidence - value < ACCEPT:
                 best, own = other, term
         return best
 
@@ -203,7 +209,7 @@ class Search:
             without = self.without(current)
             gains = [current.optimum.log_evidence - t.optimum.log_evidence for t in without]
             weakest = int(np.argmin(gains))
-            if gains[weakest] >= asked(len(current.terms)):
+            if gains[weakest] >= asked(max(1, sum(not self.terms[t].depends_on for t in current.terms))):
                 return current, tuple(gains), without
             current = without[weakest]
         return current, (), []
@@ -225,14 +231,17 @@ class Search:
             for (t, _), score in zip(starts, promises(self, rest, starts), strict=True)
             if np.isfinite(score.gain)
         ]
-        most = max((gain for t, gain in promised if t == own), default=0.0)
-        if most > 0:  # what promises as much may be the same to the data: it begins where the chosen model ended, too
-            alike = {t for t, gain in promised if t != own and gain > ALIKE * most}
-            z = self.off(chosen.optimum.z, (own,))
-            lanes = [(t, lane) for t in alike for lane in self.lanes((*rest.terms, t), t, z)]
-            for (t, _), optimum in zip(lanes, self.fitter([lane for _, lane in lanes]), strict=True):
-                self.best((*rest.terms, t), [optimum])
+        earned = chosen.optimum.log_evidence - rest.optimum.log_evidence
+        most = max((gain for t, gain in promised if t == own), default=earned)
+        # what promises as much may be the same to the data: it begins where the chosen model ended, too
+        alike = list(dict.fromkeys(t for t, gain in promised if t != own and gain > ALIKE * most))
+        z = self.off(chosen.optimum.z, (own,))
+        starts = [(t, lane) for t in alike for lane in self.lanes((*rest.terms, t), t, z)]
+        for (t, _), optimum in zip(starts, self.fitter([lane for _, lane in starts]), strict=True):
+            self.best((*rest.terms, t), [optimum])
         trials = self.add(rest, candidates, max(PROMISING, SHARE_OF_OWN * most)).trials
+        fitted = {t.terms[-1] for t in trials}
+        trials += tuple(self.best((*rest.terms, t), ()) for t in alike if t not in fitted)
         return tuple(t for t in trials if self.as_good(t, chosen, own))
 
     def as_good(self, trial: Trial, chosen: Trial, own: int) -> bool:

@@ -66,26 +66,31 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
     base = base or search.base()
     grown = _grow(search, (base,))
     if beginnings and (len(grown.path) > 2 or grown.remainder):
-        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: g.path[-1].optimum.log_evidence)
-    stages, base = grown.stages, grown.path[0]
+        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(search, g.path[-1]))
+    stages = grown.stages
     for merger in range(MOST_MERGERS + 1):
         chosen, gains, without = search.prune(grown.path[-1])
-        whole = _merged(search, chosen)
-        if whole is None or _nameless(search, whole) or merger == MOST_MERGERS:
+        stage = _merged(search, chosen)
+        if stage is None or _nameless(search, stage.trials[0]) or merger == MOST_MERGERS:
             break
+        whole = stage.trials[0]
         search.told(f"{search.terms[whole.terms[-1]].label} in place of two")
-        grown = _grow(search, _path(grown.path, whole))
-        stages += grown.stages
+        grown = _grow(search, _path(search, whole))
+        stages += (stage, *grown.stages)
     classes = tuple(search.rivals(chosen, rest) for rest in without)
-    found = Selection(base, chosen, _path(grown.path, chosen), classes, stages, gains, grown.remainder, search.tried)
-    if whole is not None and _nameless(search, whole):
-        return _without(search, found, [i for i, t in enumerate(chosen.terms) if t not in whole.terms], whole)
-    unnamed = [next((t for t in rivals if _nameless(search, t)), None) for rivals in classes]
-    beaten = [i for i, trial in enumerate(unnamed) if trial is not None]
-    if not beaten:
-        return found
-    winner = max((t for t in unnamed if t is not None), key=lambda t: t.optimum.log_evidence)
-    return _without(search, found, beaten, winner)
+    path = _path(search, chosen)
+    found = Selection(path[0], chosen, path, classes, stages, gains, grown.remainder, search.tried)
+    rivals = [next((t for t in rivals if _nameless(search, t)), None) for rivals in classes]
+    if stage is not None and _nameless(search, stage.trials[0]):
+        rivals = [
+            stage.trials[0] if t not in stage.before.terms else r for t, r in zip(chosen.terms, rivals, strict=True)
+        ]
+    return _without(search, found, rivals) if any(rivals) else found
+
+
+def _worth(search: Search, trial: Trial) -> float:
+    """Return the evidence of a model less what its effects have to earn beyond the first one's share, nats."""
+    return trial.optimum.log_evidence - sum(asked(k) - ACCEPT for k in range(1, len(trial.terms) + 1))
 
 
 def _nameless(search: Search, trial: Trial) -> bool:
@@ -113,12 +118,13 @@ def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
                 path = (*path[:-1], better)
                 continue
         stages.append(stage)
-        best = search.best_named(trials)
+        least = asked(len(current.terms) + 1)
+        best = search.best_named(trials, current.optimum.log_evidence + least)
         unnamed = next((t for t in trials if search.terms[t.terms[-1]].depends_on), None)
         gain, gain_unnamed = (
             t.optimum.log_evidence - current.optimum.log_evidence if t else -np.inf for t in (best, unnamed)
         )
-        if best is None or not gain > asked(len(current.terms) + 1) or len(current.terms) == MOST_EFFECTS:
+        if best is None or not gain > least or len(current.terms) == MOST_EFFECTS:
             if unnamed is not None and gain_unnamed > ACCEPT:
                 remainder = (search.terms[unnamed.terms[-1]], float(gain_unnamed))
             return _Grown(path, tuple(stages), remainder)
@@ -131,13 +137,12 @@ def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
 
     What first explains most is not always there: it may stand for a part of two others.
     """
-    first = grown.stages[0]
-    begun = grown.path[1:2]
-    named = [t for t in first.trials if not _nameless(search, t) and all(t.terms != b.terms for b in begun)]
-    least = first.before.optimum.log_evidence
+    first, begun = grown.stages[0], grown.path[1:2]
+    least = first.before.optimum.log_evidence + ACCEPT
+    others = [t for t in first.trials if not _nameless(search, t) and not any(_holds(search, t, b) for b in begun)]
+    hopes = [(t, _hope(search, t)) for t in others[:MOST_HOPES] if t.optimum.log_evidence > least]
     seen = [(t.optimum.log_evidence, _hope(search, t)) for t in begun]
     tried = 0
-    hopes = [(t, _hope(search, t)) for t in named[:MOST_HOPES] if t.optimum.log_evidence > least + ACCEPT]
     for trial, hope in sorted(hopes, key=lambda found: -found[0].optimum.log_evidence - found[1]):
         here = trial.optimum.log_evidence, hope
         if tried == most or any(np.allclose(here, there, rtol=0, atol=TIE / 2) for there in seen):
@@ -149,6 +154,12 @@ def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
         yield other._replace(stages=(first, *other.stages))
 
 
+def _holds(search: Search, trial: Trial, begun: Trial) -> bool:
+    """Whether the newest effect of a trial is that of another, or a more general one at the same place."""
+    term, own = (search.terms[t.terms[-1]] for t in (trial, begun))
+    return trial.terms == begun.terms or (own.effect in term.generalises and own.acts_on == term.acts_on)
+
+
 def _hope(search: Search, trial: Trial) -> float:
     """Return what the best next effect promises beside a trial's, nats."""
     named = [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on]
@@ -156,33 +167,40 @@ def _hope(search: Search, trial: Trial) -> float:
     return max((g for g in gains if np.isfinite(g)), default=0.0)
 
 
-def _merged(search: Search, chosen: Trial) -> Trial | None:
-    """Return the best model with one term in place of two of the chosen, where it does as well; None: there is none.
+def _merged(search: Search, chosen: Trial) -> Stage | None:
+    """Return the model without two of the chosen effects and, first of its trials, one term that does as well as both.
 
-    An input that arrives late makes two sensors seem late, and one function of the input two faults of it.
+    An input that arrives late makes two sensors seem late, and one function of the input two faults of it. None: there is
+    no such term.
     """
-    most, best = chosen.optimum.log_evidence, None
+    most, found = chosen.optimum.log_evidence - FURTHER, None
     for pair in combinations(chosen.terms, 2):
         less = tuple(t for t in chosen.terms if t not in pair)
         rest = search.best(less, search.fitter(search.less(chosen, less)))
-        trials = search.add(rest, [t for t in search.candidates(rest.terms) if t not in pair]).trials
-        named = search.best_named(trials)
-        for trial in [*([named] if named else []), *(t for t in trials[:1] if _nameless(search, t))]:
-            worth = trial.optimum.log_evidence + (0.0 if _nameless(search, trial) else FURTHER)
+        stage = search.add(rest, [t for t in search.candidates(rest.terms) if t not in pair])
+        named = search.best_named(stage.trials)
+        for trial in [*([named] if named else []), *(t for t in stage.trials[:1] if _nameless(search, t))]:
+            worth = trial.optimum.log_evidence - (ACCEPT if _nameless(search, trial) else 0.0)
             if worth > most:
-                most, best = worth, trial
-    return best
+                others = [t for t in stage.trials if t is not trial]
+                most, found = worth, stage._replace(trials=(trial, *others))
+    return found
 
 
-def _path(path: Sequence[Trial], chosen: Trial) -> tuple[Trial, ...]:
-    """Return the part of a path that leads to a set of effects, with that set at its end."""
-    left = [t for t in path if set(t.terms) < set(chosen.terms)]
-    return (*left, chosen) if chosen.terms else (chosen,)
+def _path(search: Search, chosen: Trial) -> tuple[Trial, ...]:
+    """Return the best fits from the simulator alone to a set of effects, one effect more at a time."""
+    path = []
+    for k in range(len(chosen.terms) + 1):
+        terms = chosen.terms[:k]
+        there = frozenset(terms) in search.known
+        path.append(search.best(terms, () if there else search.fitter(search.less(chosen, terms))))
+    return tuple(path)
 
 
-def _without(search: Search, found: Selection, beaten: Sequence[int], winner: Trial) -> Selection:
-    """Take out the effects that a function without a name beats; what it depends on is the remainder."""
-    left = cut(search, found, [i for i in range(len(found.chosen.terms)) if i not in beaten])
+def _without(search: Search, found: Selection, rivals: Sequence[Trial | None]) -> Selection:
+    """Take out the effects that a function without a name beats, per effect; what it depends on is the remainder."""
+    left = cut(search, found, [i for i, rival in enumerate(rivals) if rival is None])
+    winner = max((t for t in rivals if t is not None), key=lambda t: t.optimum.log_evidence)
     gain = float(winner.optimum.log_evidence - left.chosen.optimum.log_evidence)
     return left._replace(remainder=(search.terms[winner.terms[-1]], gain))
 
@@ -191,10 +209,11 @@ def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
     """Return what is left of a selection where only the chosen effects at these places are kept."""
     rest = tuple(found.chosen.terms[i] for i in kept)
     chosen = search.best(rest, search.fitter(search.less(found.chosen, rest)))
+    path = _path(search, chosen)
     return found._replace(
-        base=found.base if rest else chosen,
+        base=path[0],
         chosen=chosen,
-        path=_path(found.path, chosen),
+        path=path,
         classes=tuple(found.classes[i] for i in kept),
         gains=tuple(found.gains[i] for i in kept),
     )

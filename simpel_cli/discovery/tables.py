@@ -8,7 +8,7 @@ import numpy as np
 from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.assess import SETTLE, Assessment
 from simpel_cli.discovery.residual import Force
-from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.search import Search, asked
 from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.verdict import interval_of
 from simpel_cli.discovery.windows import Windows
@@ -216,6 +216,7 @@ def candidate_columns(search: Search, selection: Selection) -> Columns:
                     "step": step, "effect": term.effect, "acts_on": term.acts_on, "depends_on": ",".join(term.depends_on),
                     "expression": term.formula,
                     "log_evidence_gain": trial.optimum.log_evidence - stage.before.optimum.log_evidence,
+                    "asked": asked(len(stage.before.terms) + 1),
                     "accepted": set(trial.terms) == set(following),
                     "kept": trial.terms[-1] in selection.chosen.terms,
                     "converged": trial.optimum.converged,

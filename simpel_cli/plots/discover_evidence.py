@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.search import ACCEPT, TIE, asked
+from simpel_cli.discovery.search import ACCEPT, TIE
 from simpel_cli.plots.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
 
 LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge
@@ -25,7 +25,7 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
     figure, axes = new_figure(len(steps), 9.4 / columns, 0.9 + 0.235 * MOST_BARS, columns=columns)
     for axis, step in zip(axes, steps, strict=True):
         own = {name: column[table["step"] == step] for name, column in table.items()}
-        _bars(axis, own, found, asked(1 + steps.index(step)))
+        _bars(axis, own, found, float(own["asked"][0]))
         best = np.flatnonzero(own["accepted"]).tolist()
         what = f"+ {_label(own, best[0])}" if len(best) else "nothing more is accepted"
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
