@@ -10,12 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-EXPERIMENTS = ("free_pendulum", "cascaded_tanks", "ball_drops", "emps", "rc_car")
-CLOSED = (
-    "free_pendulum",
-    "emps",
-    "rc_car",
-)  # the loop is closed on these: SimPEL with the old and the corrected simulator
+EXPERIMENTS = ("free_pendulum", "cascaded_tanks", "ball_drops", "emps", "rc_car_bicycle", "rc_car")
+CLOSED = ("free_pendulum", "emps", "rc_car_bicycle")  # SimPEL with the old and the corrected simulator, too
+WORDS = {"rc_car_bicycle": ("effect=[vehicle]",)}
 
 
 def run(name: str, out: Path) -> dict[str, Any]:
@@ -27,6 +24,7 @@ def run(name: str, out: Path) -> dict[str, Any]:
             f"experiment={name}",
             f"close={str(name in CLOSED).lower()}",
             f"hydra.run.dir='{directory}'",
+            *WORDS.get(name, ()),
         ]
         subprocess.run([sys.executable, "-m", "simpel_cli.main", *words], check=True)
     return json.loads((directory / "verdict.json").read_text())
@@ -42,6 +40,16 @@ def row(name: str, found: dict[str, Any]) -> str:
     effects = ", ".join(f"{e['name']} on {e['acts_on']}" for e in found["effects"]) or "-"
     rest = f"; left: depends on {', '.join(found['remainder']['depends_on'])}" if found["remainder"] else ""
     return f"| {name} | {found['verdict']} | {effects}{rest} | " + " | ".join(cells) + f" | {found['seconds']:.0f} |"
+
+
+def steps(name: str, found: dict[str, Any]) -> list[str]:
+    """Return the errors some rows ahead after each accepted effect, a line each."""
+    ahead = found["error"]["horizon_steps"]
+    lines = []
+    for step in found["steps"]:
+        errors = ", ".join(f"{q} {_short(value)}" for q, value in step["error"]["horizon"].items())
+        lines.append(f"* {name}, {ahead} rows ahead, {' and '.join(step['added']) or 'calibrated'}: {errors}")
+    return lines
 
 
 def _short(value: float | None) -> str:
@@ -63,7 +71,7 @@ def main() -> None:
     for name in options.only:
         found = run(name, out)
         lines.append(row(name, found))
-        sentences.append(f"* {name}: {found['summary']}")
+        sentences += [f"* {name}: {found['summary']}", *steps(name, found)]
     text = "\n".join([*lines, "", *sentences])
     (out / "table.md").write_text(text + "\n")
     print(text)
