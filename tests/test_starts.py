@@ -6,7 +6,7 @@ import pytest
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.setup import Setup, setup
-from simpel_cli.discovery.starts import begun
+from simpel_cli.discovery.starts import begun, moved
 from simulators.model import Declared
 
 DT, ROWS, EMPTIES, FIRST = 1.0, 40, 0.3, (20.0, 45.0, 70.0, 95.0)
@@ -45,6 +45,21 @@ def test_a_smoother_puts_the_hidden_level_near_where_it_was(plan: Setup) -> None
     np.testing.assert_array_equal(after.start[:, 1], before.start[:, 1])  # what is measured stays
     assert (after.spread[:, 0] <= before.spread[:, 0]).all()
     assert (after.spread[:, 0] >= 0.15 * before.spread[:, 0]).all()
+
+
+def test_better_parameters_put_it_elsewhere(plan: Setup) -> None:
+    """So the search calibrates again: a start of the wrong parameters looked like a wrong scale of the sensor."""
+    assessor, truth = Assessor(plan, 5), np.array(FIRST)
+    z = plan.start.copy()
+    z[0] = plan.coordinates.unit(0, EMPTIES)
+    first = begun(assessor, z, plan.windows)
+    z[0] = plan.coordinates.unit(0, 0.24)
+    wrong = begun(assessor, z, plan.windows)
+    assert moved(first, wrong)
+    assert not moved(first, first)
+    whole = first.begin == 0
+    off = [np.abs(w.start[whole, 0] - truth[w.episode[whole]]).mean() for w in (first, wrong)]
+    assert off[0] < 0.5 * off[1]
 
 
 def test_the_rates_of_a_hidden_level_have_the_scale_of_the_model(plan: Setup) -> None:

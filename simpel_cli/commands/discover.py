@@ -30,7 +30,7 @@ from simpel_cli.discovery.selection import Selection, cut, select
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
-from simpel_cli.discovery.starts import begun
+from simpel_cli.discovery.starts import begun, moved
 from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
@@ -173,20 +173,23 @@ def _kept(
 def _calibrated(
     plan: Setup, fitter: Fitter, assessor: Assessor, clean: Cleaned, terminal: Terminal
 ) -> tuple[Search, Trial, Windows, Cleaned]:
-    """Calibrate the simulator, and again as long as values stand out that it does not have to follow."""
+    """Calibrate the simulator, and again as long as values stand out or hidden states turn out to begin elsewhere."""
     recording, names = clean.recording, plan.augmented.measured
-    cut = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
-    cut = {split: begun(assessor, plan.start, windows) for split, windows in cut.items()}
+    raw = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
+    cut = {split: begun(assessor, plan.start, windows) for split, windows in raw.items()}
     told = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):
         search = Search(plan._replace(windows=cut["train"]), fitter.on(cut["train"]), told)
         base = search.base()
-        after = {split: gated(assessor, base.optimum.z, windows) for split, windows in cut.items()}
+        z = base.optimum.z
+        # where hidden states begin was guessed with parameters from the middle of their ranges
+        again = {split: begun(assessor, z, raw[split]._replace(ok=windows.ok)) for split, windows in cut.items()}
+        after = {split: gated(assessor, z, windows) for split, windows in again.items()}
         clean, after = without_new(clean, cut, after, names)
-        same = np.array_equal(after["train"].ok, cut["train"].ok)
-        cut = after
-        if same:
+        settled = np.array_equal(after["train"].ok, cut["train"].ok) and not moved(cut["train"], after["train"])
+        if settled:
             break
+        cut = after
     told("calibrated")
     return search, base, cut["test"], clean
 

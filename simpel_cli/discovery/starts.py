@@ -15,6 +15,7 @@ from simpel_cli.discovery.windows import Windows
 
 PASSES = 4
 WIDE = 3.0  # standard deviations of the smoother
+MOVED = 0.1  # of the spread
 LEAST, MOST = 0.15, 1.0  # of the spread that it began with
 
 
@@ -46,3 +47,8 @@ def begun(assessor: Assessor, z: np.ndarray, windows: Windows) -> Windows:
         spread[:, hidden] = np.where(told, np.clip(WIDE * sd, LEAST * first, MOST * first), spread[:, hidden])
         windows = windows._replace(start=start, spread=spread)
     return windows
+
+
+def moved(before: Windows, after: Windows) -> bool:
+    """Whether windows begin elsewhere than before."""
+    return bool(np.any(np.abs(after.start - before.start) > MOVED * before.spread))
