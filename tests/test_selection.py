@@ -115,11 +115,13 @@ def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
     gains = {"": 0.0, "A": 20.0, "E": 15.0, "D": 14.0, "AB": 40.0, "AD": 35.0, "ABD": 61.0}
     assert Table(gains).chosen() == "ABD"
     assert Table(gains | {"DE": 60.0}).chosen(beginnings=0) == "DE"
-    assert Table(gains | {"DE": 55.0}).chosen(beginnings=0) == "ABD"
+    assert Table(gains | {"DE": 61.1 - asked(3)}).chosen(beginnings=0) == "DE"
+    assert Table(gains | {"DE": 60.9 - asked(3)}).chosen(beginnings=0) == "ABD"
 
 
 def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None:
     gains = {"": 0.0, "A": 30.0, "AD": 41.0, "B": 25.0, "BC": 80.0}
     assert Table(gains).chosen() == "BC"
     assert Table(gains).chosen(beginnings=0) == "AD"
+    assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
     assert Table({"": 0.0, "A": 30.0, "B": 25.0, "BC": 80.0}).chosen() == "A"  # one was enough: nothing was left

@@ -12,11 +12,12 @@ import numpy as np
 
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.screen import promises
-from simpel_cli.discovery.search import ACCEPT, FURTHER, TIE, Search, Stage, Trial, asked
+from simpel_cli.discovery.search import ACCEPT, TIE, Search, Stage, Trial, asked
 from simulators.effects import Term
 
 MOST_EFFECTS = 8
 MOST_MERGERS = 2
+MOST_AGAIN = 3
 MOST_HOPES = 8  # effects that a search could begin with
 BEGINNINGS = 2  # that it does begin with, beside the one that explains most
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
@@ -66,7 +67,7 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
     base = base or search.base()
     grown = _grow(search, (base,))
     if beginnings and (len(grown.path) > 2 or grown.remainder):
-        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(search, g.path[-1]))
+        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(g.path[-1]))
     stages = grown.stages
     for merger in range(MOST_MERGERS + 1):
         chosen, gains, without = search.prune(grown.path[-1])
@@ -88,9 +89,9 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
     return _without(search, found, rivals) if any(rivals) else found
 
 
-def _worth(search: Search, trial: Trial) -> float:
-    """Return the evidence of a model less what its effects have to earn beyond the first one's share, nats."""
-    return trial.optimum.log_evidence - sum(asked(k) - ACCEPT for k in range(1, len(trial.terms) + 1))
+def _worth(trial: Trial) -> float:
+    """Return the evidence of a model less what its effects have to earn, nats."""
+    return trial.optimum.log_evidence - sum(asked(k + 1) for k in range(len(trial.terms)))
 
 
 def _nameless(search: Search, trial: Trial) -> bool:
@@ -173,14 +174,21 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
     An input that arrives late makes two sensors seem late, and one function of the input two faults of it. None: there is
     no such term.
     """
-    most, found = chosen.optimum.log_evidence - FURTHER, None
+    most, found = _worth(chosen), None
     for pair in combinations(chosen.terms, 2):
         less = tuple(t for t in chosen.terms if t not in pair)
         rest = search.best(less, search.fitter(search.less(chosen, less)))
         stage = search.add(rest, [t for t in search.candidates(rest.terms) if t not in pair])
-        named = search.best_named(stage.trials)
-        for trial in [*([named] if named else []), *(t for t in stage.trials[:1] if _nameless(search, t))]:
-            worth = trial.optimum.log_evidence - (ACCEPT if _nameless(search, trial) else 0.0)
+        # with two terms less the noise may have settled elsewhere: the best begin once more with that of the chosen model
+        z = search.off(chosen.optimum.z, pair)
+        again = [t for t in stage.trials if not _nameless(search, t)][:MOST_AGAIN]
+        lanes = [(t.terms, lane) for t in again for lane in search.lanes(t.terms, t.terms[-1], z)]
+        for (terms, _), optimum in zip(lanes, search.fitter([lane for _, lane in lanes]), strict=True):
+            search.best(terms, [optimum])
+        trials = sorted((search.best(t.terms, ()) for t in stage.trials), key=lambda t: -t.optimum.log_evidence)
+        stage, named = stage._replace(trials=tuple(trials)), search.best_named(trials)
+        for trial in [*([named] if named else []), *(t for t in trials[:1] if _nameless(search, t))]:
+            worth = _worth(trial) - (ACCEPT if _nameless(search, trial) else 0.0)
             if worth > most:
                 others = [t for t in stage.trials if t is not trial]
                 most, found = worth, stage._replace(trials=(trial, *others))
