@@ -3,6 +3,8 @@
 import json
 import multiprocessing
 import os
+import threading
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -35,7 +37,7 @@ def _batch(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], wo
         begun = {d.index: out / "begun" / str(d.index) for d in waiting}
         for mark in begun.values():  # of an exam that was interrupted
             mark.unlink(missing_ok=True)
-        with ProcessPoolExecutor(workers, context) as pool:
+        with ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(os.getpid(),)) as pool:
             futures = {pool.submit(one, d, out, tuned): d for d in waiting}
             for future in as_completed(futures):
                 try:
@@ -51,6 +53,17 @@ def _batch(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], wo
         if left and not died and len(left) == len(waiting):
             raise RuntimeError("no process could be started: see the messages above")
         waiting = [d for d in left if d not in died]
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent: a worker of an exam that was killed would go on and take a core."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def one(drawn: Set, out: Path, tuned: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
