@@ -1,12 +1,20 @@
 """What a search makes of fits, with fits that are made up."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from simpel_cli.commands import discover
+from simpel_cli.commands.discover import _gated
+from simpel_cli.console import Terminal
+from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
-from simpel_cli.discovery.search import ACCEPT, QUIETER, Trial, asked
+from simpel_cli.discovery.gate import Gate
+from simpel_cli.discovery.screen import promises
+from simpel_cli.discovery.search import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.selection import select
 from simulators.effects import Expression
 from tests.test_twins import searched
@@ -125,3 +133,50 @@ def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None
     assert Table(gains).chosen(beginnings=0) == "AD"
     assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
     assert Table({"": 0.0, "A": 30.0, "B": 25.0, "BC": 80.0}).chosen() == "A"  # one was enough: nothing was left
+
+
+@pytest.mark.parametrize(
+    ("worse_fit", "less_evidence", "tied"),
+    [(0.0, TIE - 0.1, True), (SAME - 0.1, TIE + 9, True), (SAME + 0.1, TIE + 9, False), (SAME + 0.1, TIE - 0.1, True)],
+)
+def test_names_are_tied_by_evidence_or_by_fits_that_differ_in_the_width_of_priors_alone(
+    worse_fit: float, less_evidence: float, tied: bool
+) -> None:
+    search: Any = Table({"": 0.0, "A": 30.0}).search
+    a, b = (next(i for i, t in enumerate(search.terms) if t.effect == name) for name in "AB")
+    chosen = Trial((a,), search.fitter([search.beside(search.base(), a)])[0])
+    there = chosen.optimum
+    other = Trial((b,), there._replace(loss=there.loss + worse_fit, log_evidence=there.log_evidence - less_evidence))
+    assert search.as_good(other, chosen, a) is tied
+
+
+def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> None:
+    knob = {"range": ["0", "8*dt"], "unit": "s", "starts": ["0.5*dt", "5*dt"]}
+    late = Expression("late", acts_on="input", operator="delay", parameters={"d": knob})
+    search: Any = searched("b", [late])
+    search.fitter = MadeUp(search.rows[0][0], 0.0)
+    before = Trial((), search.base().optimum)
+    short, long = promises(search, before, search.starts(before, [0]))
+    assert np.isfinite(short.gain)
+    assert long.gain == np.inf
+
+
+@pytest.mark.parametrize(
+    ("refused", "harm", "again"), [(0, False, "A"), (1, False, ""), (1, True, "B"), (2, False, "")]
+)
+def test_what_the_gate_refuses_hides_nothing_that_was_found_after_it(
+    refused: int, harm: bool, again: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    search: Any = Table({"": 0.0, "A": 30.0, "AB": 60.0}).search
+    found = select(search)
+    steps = iter(range(2))
+
+    def judge(*_: Any) -> Gate:
+        passed = next(steps) != refused
+        return Gate(1.0, -1.0, 2.0, "episode", harm and not passed, passed)
+
+    monkeypatch.setattr(discover, "gate", judge)
+    left, gates, without = _gated(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
+    assert [search.terms[t].effect for t in left.chosen.terms] == list("AB"[:refused])
+    assert len(gates) == refused
+    assert [search.terms[t].effect for t in without] == list(again)

@@ -187,9 +187,9 @@ def _calibrated(
         after = {split: gated(assessor, z, windows) for split, windows in again.items()}
         clean, after = without_new(clean, cut, after, names)
         settled = np.array_equal(after["train"].ok, cut["train"].ok) and not moved(cut["train"], after["train"])
+        cut = after  # settled or not: values that stand out may be in test episodes alone
         if settled:
             break
-        cut = after
     told("calibrated")
     return search, base, cut["test"], clean
 
