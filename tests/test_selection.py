@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from simpel_cli.commands import discover
-from simpel_cli.commands.discover import _gated
+from simpel_cli.commands.discover import _calibrated, _gated
 from simpel_cli.console import Terminal
+from simpel_cli.data.recording import Recording
 from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.cleaned import Cleaned
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.screen import promises
@@ -180,3 +182,23 @@ def test_what_the_gate_refuses_hides_nothing_that_was_found_after_it(
     assert [search.terms[t].effect for t in left.chosen.terms] == list("AB"[:refused])
     assert len(gates) == refused
     assert [search.terms[t].effect for t in without] == list(again)
+
+
+def test_values_that_stand_out_in_test_episodes_alone_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    real, table = searched("b"), Table({"": 0.0})
+    test = real.plan.windows._replace(begin=real.plan.windows.begin + 1)
+    none_left = np.zeros_like(test.ok)
+    data = Recording((), (), (), {}, (), (), ())
+    for name, stub in {
+        "test_windows": lambda *_: test,
+        "begun": lambda _, __, windows: windows,
+        "gated": lambda _, __, windows: windows._replace(ok=none_left) if windows.begin[0] else windows,
+        "without_new": lambda clean, _, after, __: (clean, after),
+        "Search": lambda *_: table.search,
+    }.items():
+        monkeypatch.setattr(discover, name, stub)
+    terminal = Terminal(True, tmp_path / "run.log")
+    *_, left, _ = _calibrated(real.plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
+    np.testing.assert_array_equal(left.ok, none_left)
