@@ -164,24 +164,45 @@ def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> 
 
 
 @pytest.mark.parametrize(
-    ("refused", "harm", "again"), [(0, False, "A"), (1, False, ""), (1, True, "B"), (2, False, "")]
+    ("fails", "harm", "left", "again"),
+    [
+        ("A", False, "B", "A"),
+        ("B", False, "A", ""),
+        ("B", True, "A", "B"),
+        ("", False, "AB", ""),
+        ("AB", False, "", "A"),
+    ],
 )
-def test_what_the_gate_refuses_hides_nothing_that_was_found_after_it(
-    refused: int, harm: bool, again: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_what_the_gate_refuses_hides_no_other_effect(
+    fails: str, harm: bool, left: str, again: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    search: Any = Table({"": 0.0, "A": 30.0, "AB": 60.0}).search
+    search: Any = Table({"": 0.0, "A": 30.0, "B": 10.0, "AB": 60.0}).search
     found = select(search)
-    steps = iter(range(2))
 
-    def judge(*_: Any) -> Gate:
-        passed = next(steps) != refused
-        return Gate(1.0, -1.0, 2.0, "episode", harm and not passed, passed)
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+        names = [search.terms[t].effect for t in whole.terms]
+        assert [set(whole.terms) - set(part.terms) for part in parts] == [{t} for t in whole.terms]
+        # the first is the worse one
+        return [Gate(1.0, i - 9.0, 2.0, "episode", harm and n in fails, n not in fails) for i, n in enumerate(names)]
 
-    monkeypatch.setattr(discover, "gate", judge)
-    left, gates, without = _gated(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
-    assert [search.terms[t].effect for t in left.chosen.terms] == list("AB"[:refused])
-    assert len(gates) == refused
+    monkeypatch.setattr(discover, "gates", judge)
+    kept, judged, without = _gated(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
+    assert [search.terms[t].effect for t in kept.chosen.terms] == list(left)
+    assert len(judged) == len(kept.gains) == len(kept.classes) == len(left)
     assert [search.terms[t].effect for t in without] == list(again)
+
+
+def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    search: Any = Table({"": 0.0, "A": 30.0, "B": 2.0, "AB": 60.0}).search
+
+    def judge(_: Any, __: Any, whole: Trial, ___: Any) -> list[Gate]:
+        names = [search.terms[t].effect for t in whole.terms]
+        return [Gate(1.0, -1.0, 2.0, "episode", False, name == "B") for name in names]
+
+    monkeypatch.setattr(discover, "gates", judge)
+    kept, judged, _ = _gated(search, Assessor(search.plan, 5), select(search), Terminal(True, tmp_path / "run.log"))
+    assert kept.chosen.terms == ()
+    assert judged == []
 
 
 def test_values_that_stand_out_in_test_episodes_alone_are_left_out(

@@ -20,13 +20,13 @@ from simpel_cli.discovery.cleaned import Cleaned, cleaned, outlier_check
 from simpel_cli.discovery.corrected import corrected
 from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.gate import Gate, gates
 from simpel_cli.discovery.interactions import interaction
 from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
 from simpel_cli.discovery.residual import Forces
 from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.selection import Selection, cut, select
+from simpel_cli.discovery.selection import Selection, cut, select, weeded
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
@@ -104,13 +104,13 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     outliers = outlier_check(clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     recording = recording._replace(checks=(*recording.checks, outliers))
-    selection, gates = _selected(search, assessor, base, options, terminal)
-    selection, gates = _of_two(search, assessor, selection, gates, attach, options, terminal)
+    selection, judged = _selected(search, assessor, base, options, terminal)
+    selection, judged = _of_two(search, assessor, selection, judged, attach, options, terminal)
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,
         selection,
-        gates,
+        judged,
         before,
         after,
         assessor(selection.chosen.optimum.z, search.plan.windows),
@@ -200,46 +200,46 @@ def _selected(
     """Search, and again without an effect that the gate refused: another one may be what it stood for."""
     for _ in range(MOST_SEARCHES):
         selection = select(search, base, options.beginnings)
-        selection, gates, refused = _gated(search, assessor, selection, terminal)
+        selection, judged, refused = _gated(search, assessor, selection, terminal)
         if not refused:
             break
         search.banned.update(refused)
-    return selection, gates
+    return selection, judged
 
 
 def _gated(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
 ) -> tuple[Selection, list[Gate], list[int]]:
-    """Judge every accepted step on held-out episodes; a step that does not help there ends the list of effects.
+    """Judge on held-out episodes what every effect adds to the others; the worst that does not help goes, one at a time.
+
+    Effects that are of use only together, as a delay and a slip, are judged together so.
 
     Returns:
         what is left of the selection, its gates, and the terms to search without: with them the errors ahead grow, or
-        they are not certain and others, which they kept from being judged, had been found after them.
+        others were found after them, which might be others without them.
     """
-    gates: list[Gate] = []
-    for i, (before, after) in enumerate(zip(selection.path[:-1], selection.path[1:], strict=True)):
-        judged = gate(search, assessor, before, after)
-        gates.append(judged)
-        added = [t for t in after.terms if t not in before.terms]
-        _told(" and ".join(search.terms[t].label for t in added), judged, terminal)
-        if not judged.passed:
-            kept = before.terms
-            order = [selection.chosen.terms.index(t) for t in kept if t in selection.chosen.terms]
-            left = selection._replace(
-                chosen=before,
-                path=selection.path[: i + 1],
-                classes=tuple(selection.classes[j] for j in order),
-                gains=tuple(selection.gains[j] for j in order),
-            )
-            return left, gates[:i], added if judged.harm or i + 2 < len(selection.path) else []
-    return selection, gates, []
+    refused: list[int] = []
+    while selection.chosen.terms:
+        chosen = selection.chosen
+        parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
+        judged = gates(search, assessor, chosen, parts)
+        for term, found in zip(chosen.terms, judged, strict=True):
+            _told(search.terms[term].label, found, terminal)
+        failed = [i for i, found in enumerate(judged) if not found.passed]
+        if not failed:
+            return selection, judged, refused
+        worst = min(failed, key=lambda i: (not judged[i].harm, judged[i].low))
+        if judged[worst].harm or worst + 1 < len(chosen.terms):
+            refused.append(chosen.terms[worst])
+        selection = weeded(search, selection, [i for i in range(len(chosen.terms)) if i != worst])
+    return selection, [], refused
 
 
 def _of_two(
     search: Search,
     assessor: Assessor,
     selection: Selection,
-    gates: list[Gate],
+    judged: list[Gate],
     attach: Callable[..., Setup],
     options: Discovery,
     terminal: Terminal,
@@ -249,16 +249,16 @@ def _of_two(
     told = lambda text: terminal.line(text, "search")  # noqa: E731
     found = interaction(search, assessor, selection.chosen, attach, options.lanes, told, known)
     if found is None:
-        return selection, gates
+        return selection, judged
     _told(f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}", found.gate, terminal)
     if not found.gate.passed:
-        return selection, gates
+        return selection, judged
     gone = [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
     if gone:
         told(f"beside it {' and '.join(gone)} is not needed")
         selection = cut(search, selection, found.kept)
-        gates = [gates[i] for i in found.kept if i < len(gates)]
-    return selection._replace(remainder=(found.term, found.gain)), gates
+        judged = [judged[i] for i in found.kept if i < len(judged)]
+    return selection._replace(remainder=(found.term, found.gain)), judged
 
 
 def _told(what: str, judged: Gate, terminal: Terminal) -> None:

@@ -3,6 +3,7 @@
 On a real rig, evidence alone named a friction with +79 nats while the held-out fit got worse: the gate is mandatory.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,11 +35,12 @@ class Gate(NamedTuple):
     passed: bool
 
 
-def gate(search: Search, assessor: Assessor, before: Trial, after: Trial) -> Gate:
-    """Refit both models on all but a fold of the training episodes, score that fold, for every fold.
+def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+    """Return what a model gains over others that lack a part of it, on episodes that they were not fitted to.
 
+    All are refitted on all but a fold of the training episodes and score that fold, for every fold.
     A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
-    noise, which both models have, are fitted to the fold itself; parameters and effects are not.
+    noise, which all models have, are fitted to the fold itself; parameters and effects are not.
     """
     windows = search.plan.windows
     episodes = np.unique(windows.episode)
@@ -48,21 +50,24 @@ def gate(search: Search, assessor: Assessor, before: Trial, after: Trial) -> Gat
     order = np.random.default_rng(0).permutation(names)
     folds = [set(part.tolist()) for part in np.array_split(order, min(MOST_FOLDS, len(names)))]
     kept = [np.array([float(g not in fold) for g in groups]) for fold in folds]
-    lanes = [Lane(trial.optimum.z, search.free(trial.terms), weight) for trial in (before, after) for weight in kept]
+    lanes = [Lane(trial.optimum.z, search.free(trial.terms), weight) for trial in (whole, *parts) for weight in kept]
     found = search.fitter(lanes)
-    # how loud the noise is says nothing about the effect: both models fit it anew on what was held out
+    # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
     found = search.fitter([Lane(o.z, search.noise, 1 - lane.weight) for o, lane in zip(found, lanes, strict=True)])
-    gains = np.zeros(len(windows.episode))
-    ahead = np.zeros((2, *windows.y.shape))
-    for i, weight in enumerate(kept):
-        old, new = (assessor(found[i + k * len(folds)].z, windows) for k in (0, 1))
-        gains += np.where(weight == 0, new.log_likelihood - old.log_likelihood, 0.0)
-        for k, errors in enumerate((old.ahead, new.ahead)):
-            ahead[k, weight == 0] = errors[weight == 0]
-    per_group = np.array([gains[groups == name].sum() for name in names])
-    harm = harmful(ahead[0], ahead[1], groups)
-    low, high = gain_interval(per_group, np.random.default_rng(1))
-    return Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm)
+    likelihood = np.zeros((1 + len(parts), len(windows.episode)))
+    ahead = np.zeros((1 + len(parts), *windows.y.shape))
+    for i, (optimum, lane) in enumerate(zip(found, lanes, strict=True)):
+        trial, out = i // len(folds), lane.weight == 0
+        assessed = assessor(optimum.z, windows)
+        likelihood[trial, out] = assessed.log_likelihood[out]
+        ahead[trial, out] = assessed.ahead[out]
+    judged = []
+    for part in range(1, 1 + len(parts)):
+        gains = likelihood[0] - likelihood[part]
+        low, high = gain_interval(np.array([gains[groups == name].sum() for name in names]), np.random.default_rng(1))
+        harm = harmful(ahead[part], ahead[0], groups)
+        judged.append(Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm))
+    return judged
 
 
 def harmful(before: np.ndarray, after: np.ndarray, groups: np.ndarray) -> bool:

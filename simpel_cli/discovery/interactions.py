@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter, Lane
-from simpel_cli.discovery.gate import Gate, gate
+from simpel_cli.discovery.gate import Gate, gates
 from simpel_cli.discovery.promising import Promise, promised
 from simpel_cli.discovery.search import ACCEPT, Search, Trial
 from simpel_cli.discovery.setup import Key, Setup, key_of
@@ -96,7 +96,7 @@ def interaction(
     rest = tuple(t for t in own if t in after.terms)
     before = small.best(rest, small.fitter(small.less(after, rest)))
     gain = after.optimum.log_evidence - before.optimum.log_evidence
-    judged = gate(small, Assessor(plan, assessor.horizon), before, after)
+    (judged,) = gates(small, Assessor(plan, assessor.horizon), after, [before])
     return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
 
 

@@ -203,6 +203,10 @@ class Search:
         loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
         return [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
 
+    def part(self, current: Trial, rest: tuple[int, ...]) -> Trial:
+        """Return the best fit of some of a model's terms, which is made if there is none yet."""
+        return self.best(rest, () if frozenset(rest) in self.known else self.fitter(self.less(current, rest)))
+
     def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
         """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""
         while current.terms:

@@ -197,12 +197,7 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
 
 def _path(search: Search, chosen: Trial) -> tuple[Trial, ...]:
     """Return the best fits from the simulator alone to a set of effects, one effect more at a time."""
-    path = []
-    for k in range(len(chosen.terms) + 1):
-        terms = chosen.terms[:k]
-        there = frozenset(terms) in search.known
-        path.append(search.best(terms, () if there else search.fitter(search.less(chosen, terms))))
-    return tuple(path)
+    return tuple(search.part(chosen, chosen.terms[:k]) for k in range(len(chosen.terms) + 1))
 
 
 def _without(search: Search, found: Selection, rivals: Sequence[Trial | None]) -> Selection:
@@ -214,9 +209,8 @@ def _without(search: Search, found: Selection, rivals: Sequence[Trial | None]) -
 
 
 def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
-    """Return what is left of a selection where only the chosen effects at these places are kept."""
-    rest = tuple(found.chosen.terms[i] for i in kept)
-    chosen = search.best(rest, search.fitter(search.less(found.chosen, rest)))
+    """Return what is left of a selection of which only the chosen effects at these places are kept."""
+    chosen = search.part(found.chosen, tuple(found.chosen.terms[i] for i in kept))
     path = _path(search, chosen)
     return found._replace(
         base=path[0],
@@ -225,3 +219,10 @@ def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
         classes=tuple(found.classes[i] for i in kept),
         gains=tuple(found.gains[i] for i in kept),
     )
+
+
+def weeded(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
+    """Return the same without those that do not earn their place any more."""
+    left = cut(search, found, kept)
+    chosen, gains, _ = search.prune(left.chosen)
+    return cut(search, left, [i for i, t in enumerate(left.chosen.terms) if t in chosen.terms])._replace(gains=gains)
