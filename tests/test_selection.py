@@ -91,6 +91,9 @@ class Table:
         self.evidence = {frozenset(names): value for names, value in evidence.items()}
         self.search.banned = {i for i, term in enumerate(self.search.terms) if term.depends_on}
 
+    def name(self, term: int) -> str:
+        return "?" if self.search.terms[term].depends_on else self.search.terms[term].effect
+
     def of(self, names: frozenset[str]) -> float:
         if names in self.evidence:
             return self.evidence[names]
@@ -100,7 +103,7 @@ class Table:
         found = []
         for lane in lanes:
             on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(lane.free)}
-            value = float(self.of(frozenset(self.search.terms[i].effect for i in on)))
+            value = float(self.of(frozenset(self.name(i) for i in on)))
             d, eye = len(lane.free), np.eye(len(lane.free))
             slope = np.full(d, 100.0)  # everything promises the same, and enough to be fitted
             found.append(Optimum(lane.z, lane.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True))
@@ -135,6 +138,36 @@ def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None
     assert Table(gains).chosen(beginnings=0) == "AD"
     assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
     assert Table({"": 0.0, "A": 30.0, "B": 25.0, "BC": 80.0}).chosen() == "A"  # one was enough: nothing was left
+
+
+@pytest.mark.parametrize(
+    ("evidence", "left", "asked_for"),
+    [
+        ({"A": 30, "?": 33, "A?": 34}, "A", None),  # a function that is not clearly better
+        ({"A": 30, "?": 50, "A?": 51}, "", 50),  # one that makes the name superfluous
+        (
+            {"A": 30, "?": 50, "A?": 50 + ACCEPT + 0.1},
+            "A",
+            20 + ACCEPT + 0.1,
+        ),  # one beside which the name earns its place
+        ({"A": 30, "B": 9, "AB": 45, "A?": 61, "B?": 40, "?": 31, "AB?": 62}, "A", 31),  # in place of one of two
+        (
+            {"A": 30, "B": 9, "AB": 45, "A?": 61, "B?": 40, "?": 31, "AB?": 61 + asked(2) + 0.1},
+            "AB",
+            16 + asked(2) + 0.1,
+        ),
+    ],
+)
+def test_a_function_that_does_better_than_a_name_leaves_it_where_it_still_earns_its_place(
+    evidence: dict[str, float], left: str, asked_for: float | None
+) -> None:
+    table = Table({"": 0.0, **evidence})
+    table.search.banned = set(sorted(table.search.banned)[1:])
+    found = select(table.search)
+    assert "".join(sorted(table.name(t) for t in found.chosen.terms)) == left
+    assert len(found.classes) == len(found.gains) == len(left)
+    assert not any(table.name(t.terms[-1]) == "?" for rivals in found.classes for t in rivals)
+    assert (found.remainder[1] if found.remainder else None) == pytest.approx(asked_for)
 
 
 @pytest.mark.parametrize(

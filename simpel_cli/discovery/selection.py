@@ -80,13 +80,14 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
         stages += (stage, *grown.stages)
     classes = tuple(search.rivals(chosen, rest) for rest in without)
     path = _path(search, chosen)
-    found = Selection(path[0], chosen, path, classes, stages, gains, grown.remainder, search.tried)
+    named = tuple(tuple(t for t in rivals if not _nameless(search, t)) for rivals in classes)
+    found = Selection(path[0], chosen, path, named, stages, gains, grown.remainder, search.tried)
     rivals = [next((t for t in rivals if _nameless(search, t)), None) for rivals in classes]
     if stage is not None and _nameless(search, stage.trials[0]):
         rivals = [
             stage.trials[0] if t not in stage.before.terms else r for t, r in zip(chosen.terms, rivals, strict=True)
         ]
-    return _without(search, found, rivals) if any(rivals) else found
+    return _against(search, found, rivals) if any(rivals) else found
 
 
 def _worth(trial: Trial) -> float:
@@ -200,12 +201,41 @@ def _path(search: Search, chosen: Trial) -> tuple[Trial, ...]:
     return tuple(search.part(chosen, chosen.terms[:k]) for k in range(len(chosen.terms) + 1))
 
 
-def _without(search: Search, found: Selection, rivals: Sequence[Trial | None]) -> Selection:
-    """Take out the effects that a function without a name beats, per effect; what it depends on is the remainder."""
-    left = cut(search, found, [i for i, rival in enumerate(rivals) if rival is None])
-    winner = max((t for t in rivals if t is not None), key=lambda t: t.optimum.log_evidence)
-    gain = float(winner.optimum.log_evidence - left.chosen.optimum.log_evidence)
-    return left._replace(remainder=(search.terms[winner.terms[-1]], gain))
+def _against(search: Search, found: Selection, rivals: Sequence[Trial | None]) -> Selection:
+    """Take out the effects that a function without a name beats and makes superfluous; what it depends on is the remainder.
+
+    Args:
+        search: over sets of effects.
+        found: what was chosen.
+        rivals: per chosen effect, a model with such a function in its place that does better; None: there is none.
+    """
+    chosen = found.chosen
+    beside = [None if rival is None else _beside(search, chosen, i, rival) for i, rival in enumerate(rivals)]
+    kept = [i for i, rival in enumerate(rivals) if rival is None or beside[i]]
+    left = [
+        (search.terms[t.terms[-1]], float(t.optimum.log_evidence - chosen.optimum.log_evidence)) for t in beside if t
+    ]
+    remainder = max([*left, *([found.remainder] if found.remainder else [])], key=lambda r: r[1], default=None)
+    if len(kept) == len(rivals):
+        return found._replace(remainder=remainder)
+    short = cut(search, found, kept)
+    winner = max((t for i, t in enumerate(rivals) if t and i not in kept), key=lambda t: t.optimum.log_evidence)
+    gain = float(winner.optimum.log_evidence - short.chosen.optimum.log_evidence)
+    return short._replace(remainder=(search.terms[winner.terms[-1]], gain))
+
+
+def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None:
+    """Return the chosen model and a function without a name, if effect i still earns its place there.
+
+    A real friction is no formula: some function does better, and a formula may still be most of it.
+    """
+    function = rival.terms[-1]
+    if not search.fits((*chosen.terms, function)):
+        return None
+    (whole,) = search.add(chosen, [function]).trials
+    part = search.part(whole, (*(t for t in chosen.terms if t != chosen.terms[i]), function))
+    earned = whole.optimum.log_evidence - part.optimum.log_evidence
+    return whole if earned >= asked(len(chosen.terms)) else None
 
 
 def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
