@@ -1,9 +1,18 @@
-"""When errors ahead grow so surely that an effect is refused."""
+"""What is held out to judge an effect, and when errors ahead grow so surely that it is refused."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.gate import harmful
+from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.fit import Lane, Optimum
+from simpel_cli.discovery.gate import gates, harmful
+from simpel_cli.discovery.search import Trial
+from simpel_cli.discovery.windows import Windows
+from tests.test_twins import searched
 
 
 @pytest.mark.parametrize(
@@ -22,3 +31,73 @@ def test_a_channel_without_errors_says_nothing() -> None:
     before[..., 1] = np.nan
     assert harmful(before, 2 * before, np.arange(8))
     assert not harmful(np.full_like(before, np.nan), np.full_like(before, np.nan), np.arange(8))
+
+
+def windows_of(episode: Sequence[int], first: int) -> Windows:
+    """Windows numbered from `first` on."""
+    count = len(episode)
+    y = np.zeros((count, 9, 1))
+    begin = np.arange(first, first + count)
+    return Windows(y, y + 1, y, np.zeros((count, 1)), np.ones((count, 1)), np.array(episode), begin)
+
+
+class Fits:
+    """Fits that remember what they were not fitted to: z is [model, first rows of the windows held out; -1: left out]."""
+
+    def __init__(self, noise: tuple[int, ...], windows: Windows) -> None:
+        self.noise, self.at = noise, windows
+
+    def on(self, windows: Windows) -> "Fits":
+        return Fits(self.noise, windows)
+
+    def __call__(self, lanes: Sequence[Lane], most: int = 0) -> list[Optimum]:
+        return [optimum(self.fitted(lane)) for lane in lanes]
+
+    def fitted(self, lane: Lane) -> np.ndarray:
+        if lane.free == self.noise:
+            return lane.z  # parameters stay
+        return np.concatenate([lane.z[:1], self.at.begin[lane.weight == 0]])
+
+
+class Likelihoods(Assessor):
+    """Likelihoods that are absurd where a window had a part in the parameters."""
+
+    def __init__(self) -> None:
+        self.seen = list[int]()
+
+    def __call__(self, z: np.ndarray, windows: Windows) -> Any:
+        model, held_out = z[0], z[1:]
+        fair = np.isin(windows.begin, held_out) | ((held_out == -1).any() & (windows.begin >= 100))
+        self.seen += windows.begin[fair].tolist() if model == 0 else []
+        gain = np.where(fair, 1.0 + 0.01 * windows.begin, 1e6) * (model == 0)
+        return SimpleNamespace(log_likelihood=gain, ahead=np.full(windows.y.shape, 1.0 + model))
+
+
+def optimum(z: np.ndarray) -> Optimum:
+    nothing, eye = np.zeros(1), np.eye(1)
+    return Optimum(z, (0,), 0.0, 0.0, nothing, eye, nothing, eye, 1, True)
+
+
+@pytest.mark.parametrize(
+    ("episode", "unit", "held_out"),
+    [([0, 0, 0, 1, 1, 1], "window", [*range(6), *range(100, 108)]), ([0, 0, 1, 1, 2, 2], "episode", [*range(6)])],
+)
+def test_an_effect_is_judged_on_every_window_that_had_no_part_in_its_parameters(
+    episode: list[int], unit: str, held_out: list[int]
+) -> None:
+    search: Any = searched("b")
+    windows, spare = windows_of(episode, 0), windows_of([0] * 5 + [1] * 3, 100)
+    search.plan = search.plan._replace(windows=windows, spare=spare)
+    search.fitter, assessor = Fits(search.noise, windows), Likelihoods()
+    trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(3)]
+    first, second = gates(search, assessor, trials[0], trials[1:])
+    assert sorted(set(assessor.seen)) == held_out
+    assert first[:4] == second[:4]
+    assert first.unit == unit
+    assert first.gain == pytest.approx(sum(1 + 0.01 * i for i in held_out))
+    assert 0 < first.low < first.gain < first.high
+    assert first.passed
+    (worse,) = gates(search, assessor, trials[1], trials[:1])
+    assert worse.gain == pytest.approx(-first.gain)
+    assert worse.harm
+    assert not worse.passed

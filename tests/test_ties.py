@@ -38,11 +38,14 @@ def cut(lengths: list[int]) -> Windows:
 
 def test_a_long_record_is_thinned_evenly_and_windows_know_their_rows() -> None:
     windows = cut([100, 40])
-    few = thinned(windows, 50)
+    few, rest = thinned(windows, 50)
     assert len(few.episode) == 5
     assert set(few.episode.tolist()) == {0, 1}
     for y, episode, begin in zip(few.y, few.episode, few.begin, strict=True):
         assert y[0, 0] == 1000 * episode + begin
     assert few.begin.tolist() == [0, 30, 60, 0, 30]
-    assert thinned(windows, 1000) is windows
-    assert len(thinned(cut([100, 40]), 1).episode) == 2  # one of each episode
+    assert rest is not None
+    every = {(e, b) for part in (few, rest) for e, b in zip(part.episode.tolist(), part.begin.tolist(), strict=True)}
+    assert len(few.episode) + len(rest.episode) == len(windows.episode) == len(every)
+    assert thinned(windows, 1000) == (windows, None)
+    assert len(thinned(cut([100, 40]), 1)[0].episode) == 2  # one of each episode

@@ -176,10 +176,12 @@ def _calibrated(
     """Calibrate the simulator, and again as long as values stand out or hidden states turn out to begin elsewhere."""
     recording, names = clean.recording, plan.augmented.measured
     raw = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
+    if plan.spare is not None:
+        raw["spare"] = plan.spare
     cut = {split: begun(assessor, plan.start, windows) for split, windows in raw.items()}
     told = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):
-        search = Search(plan._replace(windows=cut["train"]), fitter.on(cut["train"]), told)
+        search = Search(plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), told)
         base = search.base()
         z = base.optimum.z
         # where hidden states begin was guessed with parameters from the middle of their ranges

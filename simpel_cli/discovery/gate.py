@@ -3,7 +3,7 @@
 On a real rig, evidence alone named a friction with +79 nats while the held-out fit got worse: the gate is mandatory.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +11,10 @@ import numpy as np
 from simpel_cli.discovery.assess import Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.search import Search, Trial
+from simpel_cli.discovery.windows import Windows
 
 MOST_FOLDS = 5
+LEAST_EPISODES = 3  # to hold out whole ones
 
 
 class Gate(NamedTuple):
@@ -38,36 +40,55 @@ class Gate(NamedTuple):
 def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
     """Return what a model gains over others that lack a part of it, on episodes that they were not fitted to.
 
-    All are refitted on all but a fold of the training episodes and score that fold, for every fold.
+    All are refitted on all but a fold of the training episodes and score that fold, for every fold. Of a few long episodes
+    windows are held out, and those that the search left out as well: they tell more, and nothing has to be fitted again.
     A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
     noise, which all models have, are fitted to the fold itself; parameters and effects are not.
     """
+    trials = (whole, *parts)
     windows = search.plan.windows
-    episodes = np.unique(windows.episode)
-    unit = "episode" if len(episodes) >= 3 else "window"
+    unit = "episode" if len(np.unique(windows.episode)) >= LEAST_EPISODES else "window"
     groups = windows.episode if unit == "episode" else np.arange(len(windows.episode))
-    names = np.unique(groups)
-    order = np.random.default_rng(0).permutation(names)
-    folds = [set(part.tolist()) for part in np.array_split(order, min(MOST_FOLDS, len(names)))]
-    kept = [np.array([float(g not in fold) for g in groups]) for fold in folds]
-    lanes = [Lane(trial.optimum.z, search.free(trial.terms), weight) for trial in (whole, *parts) for weight in kept]
+    order = np.random.default_rng(0).permutation(np.unique(groups))
+    folds = [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))]
+    lanes = [Lane(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
     found = search.fitter(lanes)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
     found = search.fitter([Lane(o.z, search.noise, 1 - lane.weight) for o, lane in zip(found, lanes, strict=True)])
-    likelihood = np.zeros((1 + len(parts), len(windows.episode)))
-    ahead = np.zeros((1 + len(parts), *windows.y.shape))
-    for i, (optimum, lane) in enumerate(zip(found, lanes, strict=True)):
-        trial, out = i // len(folds), lane.weight == 0
-        assessed = assessor(optimum.z, windows)
-        likelihood[trial, out] = assessed.log_likelihood[out]
-        ahead[trial, out] = assessed.ahead[out]
-    judged = []
-    for part in range(1, 1 + len(parts)):
-        gains = likelihood[0] - likelihood[part]
-        low, high = gain_interval(np.array([gains[groups == name].sum() for name in names]), np.random.default_rng(1))
-        harm = harmful(ahead[part], ahead[0], groups)
-        judged.append(Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm))
-    return judged
+    scored = [
+        (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)]) for i, out in enumerate(folds)
+    ]
+    if unit == "window" and search.plan.spare is not None:
+        for names, part, out in _batches(search.plan.spare, len(groups)):
+            fits = search.fitter.on(part)([Lane(t.optimum.z, search.noise, out.astype(float)) for t in trials])
+            scored.append((part, out, len(groups) + names, fits))
+    named = np.concatenate([names for _, _, names, _ in scored])
+    results = [[assessor(o.z, part) for o in fits] for part, _, _, fits in scored]
+    likelihood, ahead = (
+        [
+            np.concatenate([getattr(r[k], what)[s[1]] for s, r in zip(scored, results, strict=True)])
+            for k in range(len(trials))
+        ]
+        for what in ("log_likelihood", "ahead")
+    )
+    return [_judged(likelihood[0] - likelihood[k], ahead[k], ahead[0], named, unit) for k in range(1, len(trials))]
+
+
+def _batches(windows: Windows, size: int) -> Iterator[tuple[np.ndarray, Windows, np.ndarray]]:
+    """Cut windows into batches of one size, which share a program: names of those that count, the batch, which do."""
+    count = len(windows.episode)
+    for begin in range(0, count, size):
+        rows = np.arange(begin, begin + size)
+        counts = rows < count
+        yield rows[counts], Windows(*(a[rows % count] for a in windows)), counts
+
+
+def _judged(gains: np.ndarray, before: np.ndarray, after: np.ndarray, groups: np.ndarray, unit: str) -> Gate:
+    """Judge gains (W,) and errors ahead (W, T, ny) without and with an effect; groups: (W,)."""
+    per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
+    low, high = gain_interval(per_group, np.random.default_rng(1))
+    harm = harmful(before, after, groups)
+    return Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm)
 
 
 def harmful(before: np.ndarray, after: np.ndarray, groups: np.ndarray) -> bool:

@@ -70,7 +70,7 @@ def interaction(
         return None
     told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
     kept = {key_of(search.terms[t]) for t in chosen.terms}
-    plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows)
+    plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows, spare=search.plan.spare)
     _, n_r, n_q = plan.coordinates.sizes
     knobs = sum(len(search.terms[t].knobs) for t in chosen.terms) + max(len(t.knobs) for t in going)
     small = Search(

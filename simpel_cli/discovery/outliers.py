@@ -88,13 +88,14 @@ def without_new(
 
     Args:
         found: before gating.
-        old: windows of train and test before it.
+        old: windows of train and test, and those of train that a search leaves out (spare), before it.
         new: after it.
         names: of the channels.
     """
-    episodes = {"train": found.recording.train, "test": found.recording.test}
-    rows = sum(len(e.time) for part in episodes.values() for e in part)
-    places = [p for split in old for p in _places(split, old[split], new[split], episodes[split], names)]
+    train, test = found.recording.train, found.recording.test
+    rows = sum(len(e.time) for e in (*train, *test))
+    whose = {"train": ("train", train), "test": ("test", test), "spare": ("train", train)}
+    places = [p for part in old for p in _places(old[part], new[part], *whose[part], names)]
     too_many = dict(found.too_many)
     for j, name in enumerate(names):
         share = sum(p.name == name for p in (*found.left_out, *places)) / rows
@@ -111,7 +112,7 @@ def _column_of(ok: np.ndarray, other: np.ndarray, j: int) -> np.ndarray:
     return changed
 
 
-def _places(split: str, old: Windows, new: Windows, episodes: Sequence[Episode], names: Sequence[str]) -> list[Place]:
+def _places(old: Windows, new: Windows, split: str, episodes: Sequence[Episode], names: Sequence[str]) -> list[Place]:
     found = []
     for w, piece in enumerate(pieces(old, episodes)):
         gone = (old.ok[w] > 0) & (new.ok[w] == 0)

@@ -31,6 +31,7 @@ class Setup(NamedTuple):
     rule: Filter
     coordinates: Coordinates
     windows: Windows
+    spare: Windows | None  # of the training episodes, that the search leaves out to be quick: held out for free
     scales: Scales
     start: np.ndarray  # (n,) unit coordinates with every effect switched off
     lead: int
@@ -91,8 +92,7 @@ def setup(
         recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
-    if most_rows is not None:
-        windows = thinned(windows, most_rows)
+    windows, spare = thinned(windows, most_rows) if most_rows is not None else (windows, None)
     noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
     r = np.array(list(noise_std.values()))
     if substeps is None:
@@ -116,7 +116,7 @@ def setup(
     start[knobs] = (augmented.neutral[knobs] - coordinates.low[knobs]) / np.where(span > 0, span, 1.0)
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
-    return Setup(augmented, rule, coordinates, windows, scales, start, lead, substeps)
+    return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps)
 
 
 def measured_of(model: Model, recording: Recording) -> tuple[str, ...]:

@@ -42,19 +42,23 @@ class Windows(NamedTuple):
         return tuple(jnp.asarray(a) for a in (self.y, self.ok, self.u, self.start, self.spread))
 
 
-def thinned(windows: Windows, rows: int) -> Windows:
-    """Leave evenly spaced windows of a long record: a search needs not every row of it to tell effects apart.
+def thinned(windows: Windows, rows: int) -> tuple[Windows, Windows | None]:
+    """Choose evenly spaced windows of a long record: a search needs not every row of it to tell effects apart.
 
     Args:
         windows: all of them.
-        rows: that the rest may have, about; one window per episode stays in any case.
+        rows: that the chosen ones may have, about; one window per episode is chosen in any case.
+
+    Returns:
+        the chosen ones and the rest; None: all are chosen.
     """
     count, length = windows.ok.shape[:2]
     most = max(rows // length, len(np.unique(windows.episode)))
     if count <= most:
-        return windows
+        return windows, None
     kept = np.unique(np.linspace(0, count - 1, most).round().astype(int))
-    return Windows(*(a[kept] for a in windows))
+    rest = np.setdiff1d(np.arange(count), kept)
+    return Windows(*(a[kept] for a in windows)), Windows(*(a[rest] for a in windows))
 
 
 def windows_of(
