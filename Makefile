@@ -14,7 +14,7 @@ OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench exam lock data real clean reproduce-metrics_vs_n_train
+.PHONY: help install demo test test-slow lint format bench bench-discover exam lock data real clean reproduce-metrics_vs_n_train
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -48,6 +48,9 @@ format: install ## Format the code
 
 bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
+
+bench-discover: install ## Measure time and memory of verdicts, compiled anew and cached (needs SIMPEL_SHARED)
+	$(BIN)/python -m tests.benchmarks.verdicts
 
 exam: $(RIVALS) ## Give `simpel discover` and PySINDy the blind exam (SETS=600 SEED=1, OUT=DIR to go on, ONLY="cart car")
 	$(BIN)/python -m tests.exam --sets $(SETS) --seed $(SEED) --out $(OUT) $(if $(ONLY),--only $(ONLY))
