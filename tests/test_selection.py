@@ -11,11 +11,12 @@ from simpel_cli.commands import discover
 from simpel_cli.commands.discover import _calibrated, _gated
 from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Recording
+from simpel_cli.discovery import search as search_module
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.cleaned import Cleaned
 from simpel_cli.discovery.fit import Fitter, Lane, Optimum
 from simpel_cli.discovery.gate import Gate
-from simpel_cli.discovery.screen import promises
+from simpel_cli.discovery.screen import Score, promises
 from simpel_cli.discovery.search import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.selection import select
 from simulators.effects import Expression
@@ -138,6 +139,23 @@ def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None
     assert Table(gains).chosen(beginnings=0) == "AD"
     assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
     assert Table({"": 0.0, "A": 30.0, "B": 25.0, "BC": 80.0}).chosen() == "A"  # one was enough: nothing was left
+
+
+def test_a_function_that_promises_much_keeps_no_name_from_being_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = Table({"": 0.0})
+    table.search.banned = set(sorted(table.search.banned)[2:])
+
+    def promised(_: Any, __: Any, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+        size = {"?": 250.0, "A": 20.0, "E": 1.6}
+        return [Score(size.get(table.name(t), 19.0), 1.0) for t, _ in starts]
+
+    monkeypatch.setattr(search_module, "promises", promised)
+    base = table.search.base()
+    trials = table.search.add(base, table.search.candidates(())).trials
+    assert {table.name(t.terms[-1]) for t in trials} == {
+        "?",
+        *"ABCD",
+    }  # what promises a twelfth of the best name is left
 
 
 @pytest.mark.parametrize(

@@ -154,9 +154,11 @@ class Search:
         scores = promises(self, before, starts)
         promised = np.array([score.gain for score in scores])
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
-        finite = promised[np.isfinite(promised)]
-        least = max(least, SHARE * float(finite.max(initial=0.0)))
-        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > least]
+        named = np.array([not self.terms[t].depends_on for t, _ in starts], bool)
+        finite = np.where(np.isfinite(promised), promised, 0.0)
+        # functions without a name promise much where much is left: they keep no name from being fitted
+        most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
+        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
         found = self.fitter([starts[i][1] for i in going])
         fits: dict[int, list[Optimum]] = {}
         for i, optimum in zip(going, found, strict=True):

@@ -229,13 +229,18 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
 
     A real friction is no formula: some function does better, and a formula may still be most of it.
     """
-    function = rival.terms[-1]
+    function, own = rival.terms[-1], chosen.terms[i]
     if not search.fits((*chosen.terms, function)):
         return None
     (whole,) = search.add(chosen, [function]).trials
-    part = search.part(whole, (*(t for t in chosen.terms if t != chosen.terms[i]), function))
+    part = search.part(whole, (*(t for t in chosen.terms if t != own), function))
+    (again,) = search.add(part, [own]).trials  # begun from the other side, too: of two fits of one model the better one
+    whole = search.best(whole.terms, [again.optimum])
     earned = whole.optimum.log_evidence - part.optimum.log_evidence
-    return whole if earned >= asked(len(chosen.terms)) else None
+    what, depends_on = search.terms[own].label, " and ".join(search.terms[function].depends_on)
+    stays = earned >= asked(len(chosen.terms))
+    search.told(f"{what}: a function of {depends_on} does better{f', beside it +{earned:.0f}' if stays else ''}")
+    return whole if stays else None
 
 
 def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
