@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.assess import Assessment, Assessor
 from simpel_cli.discovery.fit import Lane, Optimum
-from simpel_cli.discovery.gate import gates, harmful
+from simpel_cli.discovery.gate import RUNAWAY, gates, harmful
 from simpel_cli.discovery.search import Trial
 from simpel_cli.discovery.windows import Windows
 from tests.test_twins import searched
@@ -62,15 +62,18 @@ class Fits:
 class Likelihoods(Assessor):
     """Likelihoods that are absurd where a window had a part in the parameters."""
 
-    def __init__(self) -> None:
-        self.seen = list[int]()
+    def __init__(self, lost: int = -1) -> None:
+        self.seen, self.lost = list[int](), lost  # a model that runs away in the window that begins in row 3
 
     def __call__(self, z: np.ndarray, windows: Windows) -> Any:
         model, held_out = z[0], z[1:]
         fair = np.isin(windows.begin, held_out) | ((held_out == -1).any() & (windows.begin >= 100))
         self.seen += windows.begin[fair].tolist() if model == 0 else []
         gain = np.where(fair, 1.0 + 0.01 * windows.begin, 1e6) * (model == 0)
-        return SimpleNamespace(log_likelihood=gain, ahead=np.full(windows.y.shape, 1.0 + model))
+        errors = np.full(windows.y.shape, 1.0 + model)
+        innovation = np.where((model == self.lost) & (windows.begin == 3), np.nan, 0.0)[:, None, None] + 0 * errors
+        track: Any = SimpleNamespace(innovation=innovation)
+        return Assessment(errors, errors, errors, errors, gain, errors, track)
 
 
 def optimum(z: np.ndarray) -> Optimum:
@@ -101,3 +104,18 @@ def test_an_effect_is_judged_on_every_window_that_had_no_part_in_its_parameters(
     assert worse.gain == pytest.approx(-first.gain)
     assert worse.harm
     assert not worse.passed
+    (lost,) = gates(
+        search, Likelihoods(lost=0), trials[0], trials[1:2]
+    )  # it would else count as a window without an error
+    assert lost.gain == pytest.approx(first.gain - 1.03 - RUNAWAY)
+    assert not lost.passed
+
+
+def test_a_single_window_cannot_be_held_out() -> None:
+    search: Any = searched("b")
+    windows = windows_of([0], 0)
+    search.plan = search.plan._replace(windows=windows, spare=None)
+    search.fitter = Fits(search.noise, windows)
+    trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(2)]
+    (judged,) = gates(search, Likelihoods(), trials[0], trials[1:])
+    assert not judged.passed

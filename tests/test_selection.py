@@ -169,6 +169,8 @@ def test_a_function_that_promises_much_keeps_no_name_from_being_fitted(monkeypat
             20 + ACCEPT + 0.1,
         ),  # one beside which the name earns its place
         ({"A": 30, "B": 9, "AB": 45, "A?": 61, "B?": 40, "?": 31, "AB?": 62}, "A", 31),  # in place of one of two
+        # each is superfluous beside the other and the function, both are not
+        ({"A": 30, "B": 28, "AB": 45, "?": 20, "A?": 61, "B?": 60, "AB?": 62}, "A", 31),
         (
             {"A": 30, "B": 9, "AB": 45, "A?": 61, "B?": 40, "?": 31, "AB?": 61 + asked(2) + 0.1},
             "AB",
@@ -217,13 +219,10 @@ def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> 
 @pytest.mark.parametrize(
     ("fails", "harm", "left", "again"),
     [
-        ("A", False, "B", "A"),
-        ("B", False, "A", ""),
-        ("B", True, "A", "B"),
-        ("", False, "AB", ""),
-        ("AB", False, "", "A"),
+        ("A", False, "B", ""), ("B", False, "A", ""), ("B", True, "A", "B"), ("", False, "AB", ""), ("AB", False, "", ""),
+        ("one of two", False, "A", ""),  # each can stand for the other: the one with less evidence goes
     ],
-)
+)  # fmt: skip
 def test_what_the_gate_refuses_hides_no_other_effect(
     fails: str, harm: bool, left: str, again: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -232,9 +231,10 @@ def test_what_the_gate_refuses_hides_no_other_effect(
 
     def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
         names = [search.terms[t].effect for t in whole.terms]
+        fail = fails if fails != "one of two" else "AB" if len(names) == 2 else ""
         assert [set(whole.terms) - set(part.terms) for part in parts] == [{t} for t in whole.terms]
-        # the first is the worse one
-        return [Gate(1.0, i - 9.0, 2.0, "episode", harm and n in fails, n not in fails) for i, n in enumerate(names)]
+        # the first is the more uncertain one
+        return [Gate(1.0, i - 9.0, 2.0, "episode", harm and n in fail, n not in fail) for i, n in enumerate(names)]
 
     monkeypatch.setattr(discover, "gates", judge)
     kept, judged, without = _gated(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
@@ -256,7 +256,7 @@ def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.Monk
     assert judged == []
 
 
-def test_values_that_stand_out_in_test_episodes_alone_are_left_out(
+def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     real, table = searched("b"), Table({"": 0.0})
@@ -272,5 +272,7 @@ def test_values_that_stand_out_in_test_episodes_alone_are_left_out(
     }.items():
         monkeypatch.setattr(discover, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
-    *_, left, _ = _calibrated(real.plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
+    plan = real.plan._replace(spare=test)
+    search, _, left, _ = _calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
     np.testing.assert_array_equal(left.ok, none_left)
+    np.testing.assert_array_equal(search.plan.spare.ok, none_left)  # what is held out to judge effects

@@ -26,7 +26,7 @@ from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
 from simpel_cli.discovery.residual import Forces
 from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.selection import Selection, cut, select, weeded
+from simpel_cli.discovery.selection import Selection, cut, refused, select
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
@@ -192,6 +192,7 @@ def _calibrated(
         cut = after  # settled or not: values that stand out may be in test episodes alone
         if settled:
             break
+    search.plan = search.plan._replace(spare=cut.get("spare"))
     told("calibrated")
     return search, base, cut["test"], clean
 
@@ -199,42 +200,42 @@ def _calibrated(
 def _selected(
     search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
 ) -> tuple[Selection, list[Gate]]:
-    """Search, and again without an effect that the gate refused: another one may be what it stood for."""
+    """Search, and again without an effect that does harm: another one may be what it stood for."""
     for _ in range(MOST_SEARCHES):
         selection = select(search, base, options.beginnings)
-        selection, judged, refused = _gated(search, assessor, selection, terminal)
-        if not refused:
+        selection, judged, harmful = _gated(search, assessor, selection, terminal)
+        if not harmful:
             break
-        search.banned.update(refused)
+        search.banned.update(harmful)
     return selection, judged
 
 
 def _gated(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
 ) -> tuple[Selection, list[Gate], list[int]]:
-    """Judge on held-out episodes what every effect adds to the others; the worst that does not help goes, one at a time.
+    """Judge on held-out episodes what every effect adds to the others; of those that fail one goes at a time.
 
-    Effects that are of use only together, as a delay and a slip, are judged together so.
+    Effects that are of use only together, as a delay and a slip, are judged together so. Of two that can stand for each other
+    the one with less evidence goes, and the other is judged without it.
 
     Returns:
-        what is left of the selection, its gates, and the terms to search without: with them the errors ahead grow, or
-        others were found after them, which might be others without them.
+        what is left of the selection, its gates, and the terms with which the errors ahead grow.
     """
-    refused: list[int] = []
+    harmful: list[int] = []
     while selection.chosen.terms:
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
         judged = gates(search, assessor, chosen, parts)
-        for term, found in zip(chosen.terms, judged, strict=True):
-            _told(search.terms[term].label, found, terminal)
         failed = [i for i, found in enumerate(judged) if not found.passed]
-        if not failed:
-            return selection, judged, refused
-        worst = min(failed, key=lambda i: (not judged[i].harm, judged[i].low))
-        if judged[worst].harm or worst + 1 < len(chosen.terms):
-            refused.append(chosen.terms[worst])
-        selection = weeded(search, selection, [i for i in range(len(chosen.terms)) if i != worst])
-    return selection, [], refused
+        gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
+        for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
+            _told(search.terms[term].label, found, terminal, out=i == gone)
+        if gone is None:
+            return selection, judged, harmful
+        if judged[gone].harm:
+            harmful.append(chosen.terms[gone])
+        selection = refused(search, selection, gone)
+    return selection, [], harmful
 
 
 def _of_two(
@@ -252,7 +253,12 @@ def _of_two(
     found = interaction(search, assessor, selection.chosen, attach, options.lanes, told, known)
     if found is None:
         return selection, judged
-    _told(f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}", found.gate, terminal)
+    _told(
+        f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}",
+        found.gate,
+        terminal,
+        out=not found.gate.passed,
+    )
     if not found.gate.passed:
         return selection, judged
     gone = [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
@@ -263,10 +269,10 @@ def _of_two(
     return selection._replace(remainder=(found.term, found.gain)), judged
 
 
-def _told(what: str, judged: Gate, terminal: Terminal) -> None:
-    why = "the errors ahead grow" if judged.harm else "not certain"
+def _told(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
+    why = "" if judged.passed else ", the errors ahead grow" if judged.harm else ", not certain"
     terminal.line(
         f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
-        f" by {judged.unit}{'' if judged.passed else f', {why}: not accepted'}",
+        f" by {judged.unit}{why}{': not accepted' if out else ''}",
         "gate",
     )

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.assess import Assessor, gain_interval, reduction_interval
+from simpel_cli.discovery.assess import Assessment, Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.windows import Windows
+from simpel_cli.discovery.windows import LEAST_EPISODES, Windows
 
 MOST_FOLDS = 5
-LEAST_EPISODES = 3  # to hold out whole ones
+RUNAWAY = 1e4  # nats that a window costs a model that ran away in it
 
 
 class Gate(NamedTuple):
@@ -41,7 +41,7 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     """Return what a model gains over others that lack a part of it, on episodes that they were not fitted to.
 
     All are refitted on all but a fold of the training episodes and score that fold, for every fold. Of a few long episodes
-    windows are held out, and those that the search left out as well: they tell more, and nothing has to be fitted again.
+    windows are held out, and those that the search left out as well: they tell more, and no parameter has to be fitted again.
     A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
     noise, which all models have, are fitted to the fold itself; parameters and effects are not.
     """
@@ -50,7 +50,10 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     unit = "episode" if len(np.unique(windows.episode)) >= LEAST_EPISODES else "window"
     groups = windows.episode if unit == "episode" else np.arange(len(windows.episode))
     order = np.random.default_rng(0).permutation(np.unique(groups))
-    folds = [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))]
+    # a single window cannot be held out: there is nothing else to fit to
+    folds = (
+        [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))] if len(order) > 1 else []
+    )
     lanes = [Lane(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
     found = search.fitter(lanes)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
@@ -62,16 +65,21 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
         for names, part, out in _batches(search.plan.spare, len(groups)):
             fits = search.fitter.on(part)([Lane(t.optimum.z, search.noise, out.astype(float)) for t in trials])
             scored.append((part, out, len(groups) + names, fits))
+    if not scored:
+        return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]
     named = np.concatenate([names for _, _, names, _ in scored])
-    results = [[assessor(o.z, part) for o in fits] for part, _, _, fits in scored]
-    likelihood, ahead = (
-        [
-            np.concatenate([getattr(r[k], what)[s[1]] for s, r in zip(scored, results, strict=True)])
-            for k in range(len(trials))
-        ]
-        for what in ("log_likelihood", "ahead")
-    )
+    likelihood, ahead = [], []
+    for k in range(len(trials)):
+        found_by = [(assessor(fits[k].z, part), part, out) for part, out, _, fits in scored]
+        likelihood.append(np.concatenate([_likelihood(a, part)[out] for a, part, out in found_by]))
+        ahead.append(np.concatenate([a.ahead[out] for a, _, out in found_by]))
     return [_judged(likelihood[0] - likelihood[k], ahead[k], ahead[0], named, unit) for k in range(1, len(trials))]
+
+
+def _likelihood(found: Assessment, windows: Windows) -> np.ndarray:
+    """Log-likelihood of every window, (W,); far down where the model ran away."""
+    lost = (~np.isfinite(found.track.innovation) & (windows.ok > 0)).any(axis=(1, 2))
+    return np.where(lost, -RUNAWAY, found.log_likelihood)
 
 
 def _batches(windows: Windows, size: int) -> Iterator[tuple[np.ndarray, Windows, np.ndarray]]:

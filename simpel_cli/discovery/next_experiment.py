@@ -93,8 +93,6 @@ def class_of(search: Search, selection: Selection) -> Class:
     terms = search.terms
     trials, names, pairs = [selection.chosen], [], []
     for chosen, rivals in zip(selection.chosen.terms, selection.classes, strict=True):
-        if any(terms[t.terms[-1]].depends_on for t in rivals):
-            continue  # beaten by a function without a name: no class of names
         others: dict[str, Trial] = {}
         for trial in rivals:
             term = terms[trial.terms[-1]]

@@ -4,7 +4,7 @@ A named effect has to beat every other name and every function without one; name
 have to beat every single term in place of both.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -30,12 +30,10 @@ class Selection(NamedTuple):
         base: the simulator as it is, calibrated.
         chosen: with the effects that earned their place.
         path: fits after each accepted effect, from `base` on.
-        classes: per chosen term, trials that do as well with another name in its place, or clearly better with a
-            function that has no name.
+        classes: per chosen term, trials that do as well with another name in its place.
         stages: all that was tried; the last one found nothing more.
         gains: evidence that each chosen term adds to the rest.
         remainder: an unnamed function that the data still ask for, and its gain.
-        tried: number of candidates fitted.
     """
 
     base: Trial
@@ -45,7 +43,6 @@ class Selection(NamedTuple):
     stages: tuple[Stage, ...]
     gains: tuple[float, ...]
     remainder: tuple[Term, float] | None
-    tried: int
 
 
 class _Grown(NamedTuple):
@@ -78,16 +75,10 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
         search.told(f"{search.terms[whole.terms[-1]].label} in place of two")
         grown = _grow(search, _path(search, whole))
         stages += (stage, *grown.stages)
-    classes = tuple(search.rivals(chosen, rest) for rest in without)
     path = _path(search, chosen)
-    named = tuple(tuple(t for t in rivals if not _nameless(search, t)) for rivals in classes)
-    found = Selection(path[0], chosen, path, named, stages, gains, grown.remainder, search.tried)
-    rivals = [next((t for t in rivals if _nameless(search, t)), None) for rivals in classes]
-    if stage is not None and _nameless(search, stage.trials[0]):
-        rivals = [
-            stage.trials[0] if t not in stage.before.terms else r for t, r in zip(chosen.terms, rivals, strict=True)
-        ]
-    return _against(search, found, rivals) if any(rivals) else found
+    found = Selection(path[0], chosen, path, (), stages, gains, grown.remainder)
+    instead = stage.trials[0] if stage is not None and _nameless(search, stage.trials[0]) else None
+    return _against(search, found, without, instead)
 
 
 def _worth(trial: Trial) -> float:
@@ -201,43 +192,69 @@ def _path(search: Search, chosen: Trial) -> tuple[Trial, ...]:
     return tuple(search.part(chosen, chosen.terms[:k]) for k in range(len(chosen.terms) + 1))
 
 
-def _against(search: Search, found: Selection, rivals: Sequence[Trial | None]) -> Selection:
-    """Take out the effects that a function without a name beats and makes superfluous; what it depends on is the remainder.
+def _against(search: Search, found: Selection, without: Sequence[Trial], instead: Trial | None = None) -> Selection:
+    """Take out, one at a time, the effects that a function without a name makes superfluous; name the rivals of the rest.
 
     Args:
         search: over sets of effects.
         found: what was chosen.
-        rivals: per chosen effect, a model with such a function in its place that does better; None: there is none.
+        without: per chosen effect, the model that lacks it.
+        instead: a model with a function without a name in place of two of them, that does better; None: there is none.
     """
-    chosen = found.chosen
-    beside = [None if rival is None else _beside(search, chosen, i, rival) for i, rival in enumerate(rivals)]
-    kept = [i for i, rival in enumerate(rivals) if rival is None or beside[i]]
-    left = [
-        (search.terms[t.terms[-1]], float(t.optimum.log_evidence - chosen.optimum.log_evidence)) for t in beside if t
-    ]
-    remainder = max([*left, *([found.remainder] if found.remainder else [])], key=lambda r: r[1], default=None)
-    if len(kept) == len(rivals):
-        return found._replace(remainder=remainder)
-    short = cut(search, found, kept)
-    winner = max((t for i, t in enumerate(rivals) if t and i not in kept), key=lambda t: t.optimum.log_evidence)
-    gain = float(winner.optimum.log_evidence - short.chosen.optimum.log_evidence)
-    return short._replace(remainder=(search.terms[winner.terms[-1]], gain))
+    left = {search.terms.index(found.remainder[0]): found.remainder[1]} if found.remainder else {}
+    while True:
+        chosen, classes = found.chosen, list[tuple[Trial, ...]]()
+        superfluous: dict[int, int] = {}
+        for i, rest in enumerate(without):
+            rivals = search.rivals(chosen, rest)
+            classes.append(tuple(t for t in rivals if not _nameless(search, t)))
+            beaten = next((t for t in rivals if _nameless(search, t)), None)
+            if instead is not None and chosen.terms[i] not in instead.terms:
+                beaten = instead
+            whole = None if beaten is None else _beside(search, chosen, i, beaten)
+            if whole is not None:
+                left[whole.terms[-1]] = whole.optimum.log_evidence - chosen.optimum.log_evidence
+            elif beaten is not None:
+                superfluous[i] = beaten.terms[-1]
+        if not superfluous:
+            break
+        gone = min(superfluous, key=lambda i: found.gains[i])
+        found, without = weeded(search, found, [i for i in range(len(chosen.terms)) if i != gone])
+        left, instead = _asked_for(search, found.chosen, {superfluous[gone], *left}), None
+    most = max(left, key=lambda t: left[t], default=None)
+    remainder = None if most is None or left[most] <= ACCEPT else (search.terms[most], float(left[most]))
+    return found._replace(classes=tuple(classes), remainder=remainder)
+
+
+def _asked_for(search: Search, chosen: Trial, functions: Collection[int]) -> dict[int, float]:
+    """Return what functions without a name earn beside a model, as far as the program has room, nats."""
+    here = [t for t in functions if search.fits((*chosen.terms, t))]
+    trials = search.add(chosen, here).trials if here else ()
+    return {t.terms[-1]: t.optimum.log_evidence - chosen.optimum.log_evidence for t in trials}
 
 
 def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None:
-    """Return the chosen model and a function without a name, if effect i still earns its place there.
+    """Return the chosen model and a function without a name, unless that makes effect i superfluous.
 
-    A real friction is no formula: some function does better, and a formula may still be most of it.
+    A real friction is no formula: some function does better, and a formula may still be most of it. Where the program has no
+    room for both, the formula stays.
     """
     function, own = rival.terms[-1], chosen.terms[i]
-    if not search.fits((*chosen.terms, function)):
-        return None
-    (whole,) = search.add(chosen, [function]).trials
-    part = search.part(whole, (*(t for t in chosen.terms if t != own), function))
-    (again,) = search.add(part, [own]).trials  # begun from the other side, too: of two fits of one model the better one
-    whole = search.best(whole.terms, [again.optimum])
-    earned = whole.optimum.log_evidence - part.optimum.log_evidence
     what, depends_on = search.terms[own].label, " and ".join(search.terms[function].depends_on)
+    if not search.fits((*chosen.terms, function)):
+        search.told(f"{what}: a function of {depends_on} does better; no room for both (discovery.room)")
+        return rival
+    terms = (*chosen.terms, function)
+    starts = []
+    for z, new, other in ((chosen.optimum.z, function, rival), (rival.optimum.z, own, chosen)):
+        z = search.loud(z)
+        rows = list(search.rows[new])
+        z[rows] = other.optimum.z[rows]
+        starts.append(Lane(z, search.free(terms), search.ones))
+    whole = search.best(terms, search.fitter(starts))
+    rest = (*(t for t in chosen.terms if t != own), function)
+    part = search.best(rest, search.fitter(search.less(whole, rest)))
+    earned = whole.optimum.log_evidence - part.optimum.log_evidence
     stays = earned >= asked(len(chosen.terms))
     search.told(f"{what}: a function of {depends_on} does better{f', beside it +{earned:.0f}' if stays else ''}")
     return whole if stays else None
@@ -245,19 +262,30 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
 
 def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
     """Return what is left of a selection of which only the chosen effects at these places are kept."""
-    chosen = search.part(found.chosen, tuple(found.chosen.terms[i] for i in kept))
+    rest = tuple(found.chosen.terms[i] for i in kept)
+    chosen = search.best(rest, search.fitter(search.less(found.chosen, rest)))
     path = _path(search, chosen)
     return found._replace(
         base=path[0],
         chosen=chosen,
         path=path,
-        classes=tuple(found.classes[i] for i in kept),
+        classes=tuple(found.classes[i] for i in kept) if found.classes else (),
         gains=tuple(found.gains[i] for i in kept),
     )
 
 
-def weeded(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
-    """Return the same without those that do not earn their place any more."""
+def weeded(search: Search, found: Selection, kept: Sequence[int]) -> tuple[Selection, tuple[Trial, ...]]:
+    """Return the same without those that do not earn their place any more, and, per effect, the model that lacks it."""
     left = cut(search, found, kept)
-    chosen, gains, _ = search.prune(left.chosen)
-    return cut(search, left, [i for i, t in enumerate(left.chosen.terms) if t in chosen.terms])._replace(gains=gains)
+    chosen, gains, without = search.prune(left.chosen)
+    left = cut(search, left, [i for i, t in enumerate(left.chosen.terms) if t in chosen.terms])
+    return left._replace(gains=gains), tuple(without)
+
+
+def refused(search: Search, found: Selection, i: int) -> Selection:
+    """Return a selection without effect i, which held-out episodes refused; with it, others are rivals than without it."""
+    left, without = weeded(search, found, [j for j in range(len(found.chosen.terms)) if j != i])
+    known = [search.terms.index(found.remainder[0])] if found.remainder else []
+    gains = _asked_for(search, left.chosen, known)
+    remainder = next(((search.terms[t], float(gain)) for t, gain in gains.items() if gain > ACCEPT), None)
+    return _against(search, left._replace(remainder=remainder), without)

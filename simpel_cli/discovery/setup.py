@@ -11,13 +11,14 @@ from simpel_cli.discovery.augmented import Augmented, augment
 from simpel_cli.discovery.coordinates import Coordinates, coordinates_of
 from simpel_cli.discovery.filter import Filter, filter_of
 from simpel_cli.discovery.steps import substeps_needed
-from simpel_cli.discovery.windows import Windows, thinned, windows_of
+from simpel_cli.discovery.windows import LEAST_EPISODES, Windows, thinned, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import BACKLASH, DELAY, LAG
 from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
+MOST_SPARE = 4  # times the rows of a search: windows that are held out for free
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
@@ -93,6 +94,9 @@ def setup(
         at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
     windows, spare = thinned(windows, most_rows) if most_rows is not None else (windows, None)
+    if spare is not None and most_rows is not None:
+        # whole episodes are held out where there are enough, and of very long records a part tells enough
+        spare = None if len(np.unique(windows.episode)) >= LEAST_EPISODES else thinned(spare, MOST_SPARE * most_rows)[0]
     noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
     r = np.array(list(noise_std.values()))
     if substeps is None:

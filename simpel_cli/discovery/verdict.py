@@ -85,7 +85,7 @@ def verdict_of(
         "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
         "next_experiment": None,
         "corrected_sim": None,
-        "candidates_tried": selection.tried,
+        "candidates_tried": search.tried,
         "seconds": round(seconds, 2),
     }
     return found | {"summary": sentence(found, before, after, measured)}

@@ -12,6 +12,7 @@ from simpel_cli.errors import DataError
 
 LEAST = 3  # rows of a window: a start, and one that it predicts, and one that confirms it
 LONGEST = 256  # rows of a window: a longer record is cut, and its windows run side by side
+LEAST_EPISODES = 3  # to hold out whole ones
 LONGEST_TEST = 2048  # of a window on which free runs are judged
 
 
