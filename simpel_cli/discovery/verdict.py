@@ -274,11 +274,9 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
     gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
     parts = [_phrase(e) for e in found["effects"]]
     listed = " and ".join(parts)
+    rest = f" What is left depends on {', '.join(found['remainder']['depends_on'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
-            rest = (
-                f" What is left depends on {', '.join(found['remainder']['depends_on'])}." if found["remainder"] else ""
-            )
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
         case "ambiguous":
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
@@ -288,7 +286,7 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
                 if len(parts) > 1
                 else ""
             )
-            return f"Causes that fit these data equally well: {names}.{also} {gain}"
+            return f"Causes that fit these data equally well: {names}.{also} {gain}{rest}"
         case "unexplained":
             return f"The simulator lacks something without a name: {found['remainder']['description']}."
         case _:
