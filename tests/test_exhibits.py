@@ -47,7 +47,7 @@ def shown() -> dict[str, Exhibit]:
         trial((load, drag), 99.0, 0.01),
     )
     stages = (Stage(base, (one, other)), Stage(one, (both,)))
-    selection = Selection(base, both, (base, one, both), ((), ()), stages, (90.0, 9.0), None, 3)
+    selection = Selection(base, both, (base, one, both), ((), ()), stages, (90.0, 9.0), None)
     assessor = Assessor(plan, 3)
     windows = held_out(plan, measured.test, measured.outputs)
     before, after = (assessor(t.optimum.z, windows) for t in (base, both))

@@ -167,7 +167,7 @@ def tied() -> tuple[Search, Selection]:
     trials = search.add(base, [effects.index("coulomb_friction"), effects.index("viscous_friction")]).trials
     chosen, rival = trials
     stages = (Stage(base, tuple(trials)),)
-    return search, Selection(base, chosen, (base, chosen), ((rival,),), stages, (9.0,), None, 2)
+    return search, Selection(base, chosen, (base, chosen), ((rival,),), stages, (9.0,), None)
 
 
 @pytest.fixture(scope="module")
