@@ -84,14 +84,25 @@ class ScoreEstimator(Protocol):
     """Score of the joint log density of one output at M points; the caller vmaps over outputs."""
 
     @property
-    def closed_form_gap(self) -> bool:
-        """Whether the Gaussian part enters as a covariance; otherwise the caller adds draws of it to the samples."""
+    def gap_draws(self) -> bool:
+        """Whether draws of the Gaussian part are needed, beside its covariance."""
         ...
 
     def __call__(
-        self, h: Float[Array, "L M"], samples: Float[Array, "N M"], covariance: Float[Array, "M M"]
+        self,
+        h: Float[Array, "L M"],
+        samples: Float[Array, "N M"],
+        covariance: Float[Array, "M M"],
+        gap: Float[Array, "N M"] | None = None,
     ) -> Float[Array, "L M"]:
-        """Return the scores at L function values."""
+        """Return the scores at L function values.
+
+        Args:
+            h: function values.
+            samples: draws of the simulator's part of the prior.
+            covariance: of the Gaussian part, which is independent of it.
+            gap: draws of the Gaussian part, where they are needed; None: it is 0.
+        """
         ...
 
 
@@ -101,6 +112,14 @@ class Setting(NamedTuple):
     prior: PriorProcess
     score: ScoreEstimator
     sample_inputs: Callable[[PRNGKeyArray, int], Float[Array, "n dx"]]
+
+
+class Info(NamedTuple):
+    """What a step reports; mean_kernel: between particles, 0 where they do not interact."""
+
+    loss: Float[Array, ""]
+    noise_std: Float[Array, " dy"]
+    mean_kernel: Float[Array, ""]
 
 
 class Inference(NamedTuple):
@@ -135,6 +154,11 @@ class Method(Protocol):
     @property
     def pool(self) -> int:
         """Number of domain points that a stretch of steps chooses from."""
+        ...
+
+    @property
+    def uses_score(self) -> bool:
+        """Whether a score of the prior is estimated."""
         ...
 
     @property

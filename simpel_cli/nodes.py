@@ -18,7 +18,7 @@ from typing import Any
 from simpel_cli.errors import ConfigError, did_you_mean
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
-ROLES = {"sim": "model", "prior": "uses_simulator", "score": "closed_form_gap", "method": "bind"}
+ROLES = {"sim": "model", "prior": "uses_simulator", "score": "gap_draws", "method": "bind"}
 
 
 def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type | None = None) -> Any:
@@ -162,11 +162,12 @@ def _type_name(hint: Any) -> str:
 
 def _field_docs(cls: type) -> dict[str, str]:
     """First sentences of the `Args:` section of a dataclass's docstring."""
-    section = re.split(r"\n\s*Args:\n", inspect.getdoc(cls) or "", maxsplit=1)
-    if len(section) < 2:
-        return {}
-    docs = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", section[1], re.M)
-    return {name: re.sub(r"\s+", " ", text).strip() for name, text in docs}
+    docs: dict[str, str] = {}
+    for base in reversed(cls.__mro__):  # a field is described where it is declared
+        section = re.split(r"\n\s*Args:\n", inspect.cleandoc(base.__doc__ or ""), maxsplit=1)
+        found = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", section[1], re.M) if len(section) > 1 else []
+        docs |= {name: re.sub(r"\s+", " ", text).strip() for name, text in found}
+    return docs
 
 
 def _described(cls: type, name: str, hints: dict[str, Any]) -> str:

@@ -67,7 +67,7 @@ class FunctionPrior(NamedTuple):
     draws: int
     white_variance: float
     kernel: Kernel | None
-    input_scale: np.ndarray
+    input_scale: Float[Array | np.ndarray, " dx"]
     params: tuple[Quantity, ...]
     step: OneStep | None
     dim_y: int
@@ -114,12 +114,13 @@ class SimulatorPrior:
         if not self.white_variance > 0:
             raise ConfigError(f"prior.white_variance: got {self.white_variance}; it must be positive.")
 
-    def bind(self, system: Transition | None, dim_x: int, dim_y: int, x_std: np.ndarray) -> FunctionPrior:
+    def bind(
+        self, system: Transition | None, dim_x: int, dim_y: int, x_std: Float[Array | np.ndarray, " dx"]
+    ) -> FunctionPrior:
         """Bind to a simulator (None: it can only be queried, and its draws come as a bank)."""
         step, params = (system.step, system.params) if system is not None else (None, ())
-        kernel, input_scale = None, np.ones(dim_x)
-        if self.gap is not None:
-            kernel, input_scale = self.gap.kernel, _input_scale(self.gap, x_std)
+        kernel = self.gap.kernel if self.gap is not None else None
+        input_scale = _input_scale(self.gap, x_std) if self.gap is not None else np.ones(dim_x)
         return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, dim_y)
 
 
@@ -147,16 +148,18 @@ class GPPrior:
         """The process itself, as the Gaussian part of a prior whose simulator part is zero."""
         return GapGP(self.kernel, self.lengthscale, "normalised", self.scale)
 
-    def bind(self, system: Transition | None, dim_x: int, dim_y: int, x_std: np.ndarray) -> FunctionPrior:
+    def bind(
+        self, system: Transition | None, dim_x: int, dim_y: int, x_std: Float[Array | np.ndarray, " dx"]
+    ) -> FunctionPrior:
         """Bind to the dimensions of a system; its simulator is not used."""
         return FunctionPrior(
             self.draws, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, dim_y
         )
 
 
-def _input_scale(gap: GapGP, x_std: np.ndarray) -> np.ndarray:
+def _input_scale(gap: GapGP, x_std: Float[Array | np.ndarray, " dx"]) -> Float[Array | np.ndarray, " dx"]:
     lengthscale = gap.lengthscale if gap.lengthscale is not None else 2.0 * len(x_std) ** 0.5
-    return (x_std if gap.lengthscale_units == "raw" else np.ones_like(x_std)) / lengthscale
+    return x_std / lengthscale if gap.lengthscale_units == "raw" else np.full(len(x_std), 1 / lengthscale)
 
 
 def sample_parameters(

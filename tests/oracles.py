@@ -55,3 +55,19 @@ def ledoit_wolf_weight(samples: np.ndarray) -> float:
     d2 = np.linalg.norm(s - np.trace(s) / m * np.eye(m)) ** 2
     b2 = sum(np.linalg.norm(np.outer(row, row) - s) ** 2 for row in centred) / n**2
     return float(min(b2, d2) / d2)
+
+
+def mixture_score(h: np.ndarray, centres: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Gradient of the log density of an equal-weight mixture of Gaussians with one covariance at the rows of h."""
+    apart = h[:, None] - centres[None]
+    pulls = -np.linalg.solve(covariance, apart.reshape(-1, h.shape[1]).T).T.reshape(apart.shape)
+    log_density = 0.5 * np.sum(pulls * apart, axis=-1)
+    weight = np.exp(log_density - log_density.max(axis=1, keepdims=True))
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    return np.asarray(np.sum(weight[..., None] * pulls, axis=1))
+
+
+def lognormal_score(h: np.ndarray, root: np.ndarray, sigma: float) -> np.ndarray:
+    """Gradient of the log density of root v at the rows of h, log v_i ~ N(0, sigma^2) independent."""
+    v = np.linalg.solve(root, h.T).T
+    return np.linalg.solve(root.T, (-(np.log(v) / sigma**2 + 1) / v).T).T

@@ -9,7 +9,8 @@ import optax
 import pytest
 from scipy.stats import skew
 
-from simpel_cli.methods.fsvgd import distinct_rows, stein_velocity
+from simpel_cli.methods.fsvgd import stein_velocity
+from simpel_cli.methods.function_space import distinct_rows
 
 
 def test_two_particles_by_hand() -> None:

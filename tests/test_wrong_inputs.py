@@ -70,7 +70,7 @@ CASES = [
     case("typo in a group", "fit metod=fsvgd", CONFIG, "metod: no such key or group of `simpel fit`", "Did you mean method?"),
     case("typo in a dotted group", "fit metod.steps=3", CONFIG, "metod: no such key or group", "Did you mean method?"),
     case("unknown option", "fit method=simple", CONFIG, "method: no option 'simple'", "Did you mean simpel?",
-         "available: fsvgd, simpel"),
+         "available: ensemble, fsvgd"),
     case("experiment that does not exist", "fit experiment=pendulun", CONFIG, "experiment: no option 'pendulun'",
          "Did you mean pendulum?"),
     case("own data without --config-dir", "fit data=rig", CONFIG, "data: no option 'rig'", "available: "),

@@ -37,8 +37,13 @@ def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) 
 
 
 def _method(study: Study) -> str:
+    return f"{named_method(study)}, {study.method.particles} particles, {study.method.steps} steps"
+
+
+def named_method(study: Study) -> str:
+    """Return the method's name, with that of the score where it estimates one."""
     method, score = study.choices.get("method", ""), study.choices.get("score", "")
-    return f"{method} ({score} score), {study.method.particles} particles, {study.method.steps} steps"
+    return f"{method} ({score} score)" if study.method.uses_score else method
 
 
 def _kappa(study: Study, fitted: Fitted) -> str:

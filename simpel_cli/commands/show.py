@@ -7,6 +7,7 @@ import numpy as np
 
 from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
+from simpel_cli.commands.run_table import named_method
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
 from simpel_cli.data import Recording
@@ -33,10 +34,9 @@ NOTE = (
 def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
     """Say in a few lines what was understood."""
     s, recording, source = study.settings, study.recording, study.system.source
-    method, score = study.choices.get("method", ""), study.choices.get("score", "")
     seeds = f"seed {s.seed}" if s.seeds == 1 else f"seeds {s.seed}..{s.seed + s.seeds - 1}"
     terminal.line(
-        f"simpel fit · {s.name} · {method} ({score} score) · {seeds} · {study.device.platform} {s.precision}",
+        f"simpel fit · {s.name} · {named_method(study)} · {seeds} · {study.device.platform} {s.precision}",
         style="bold",
     )
     describe_data(terminal, recording, f"{extent_of_split(recording)}, {_used(study, fitted)}")

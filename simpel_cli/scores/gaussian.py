@@ -28,35 +28,37 @@ class Gaussian:
 
     shrinkage: str = "none"
 
-    closed_form_gap = True  # not a field: the caller adds the gap's covariance instead of draws of it
+    gap_draws = False  # not a field: the gap's covariance enters, draws of it are not needed
 
     def __post_init__(self) -> None:
         if self.shrinkage not in ("none", "ledoit_wolf"):
             raise ConfigError(f"score.shrinkage: got {self.shrinkage!r}; allowed are none and ledoit_wolf.")
 
     def __call__(
-        self, h: Float[Array, "L M"], samples: Float[Array, "N M"], covariance: Float[Array, "M M"]
+        self,
+        h: Float[Array, "L M"],
+        samples: Float[Array, "N M"],
+        covariance: Float[Array, "M M"],
+        gap: Float[Array, "N M"] | None = None,
     ) -> Float[Array, "L M"]:
-        """Return the score of the joint log density of one output at M points.
+        """Return the score of the joint log density of one output at M points; see `ScoreEstimator`.
 
-        Args:
-            h: function values of L particles.
-            samples: N draws of the sampled part of the prior.
-            covariance: known covariance of the rest, positive definite.
-
-        Returns:
-            Scores in the dtype of `h`. The factorisation runs in float64: the draws of a parametric simulator span few
-            directions, so Sigma is close to singular.
+        The factorisation runs in float64: the draws of a parametric simulator span few directions, so Sigma is close to
+        singular.
         """
-        n = samples.shape[0]
-        mean = jnp.mean(samples, axis=0)
-        centred = samples - mean[None]
-        sampled = (centred.T @ centred / (n - 1)).astype(jnp.float64)
+        mean, sampled = moments(samples)
         if self.shrinkage == "ledoit_wolf":
-            sampled = _ledoit_wolf(centred.astype(jnp.float64), sampled)
+            sampled = _ledoit_wolf((samples - mean[None]).astype(jnp.float64), sampled)
         factor = jnp.linalg.cholesky(sampled + covariance.astype(jnp.float64))
         residual = (h - mean[None]).astype(jnp.float64)
         return -jax.scipy.linalg.cho_solve((factor, True), residual.T).T.astype(h.dtype)
+
+
+def moments(samples: Float[Array, "N M"]) -> tuple[Float[Array, " M"], Float[Array, "M M"]]:
+    """Return the mean of draws, and their unbiased covariance in float64."""
+    mean = jnp.mean(samples, axis=0)
+    centred = samples - mean[None]
+    return mean, (centred.T @ centred / (samples.shape[0] - 1)).astype(jnp.float64)
 
 
 def _ledoit_wolf(centred: Float[Array, "N M"], covariance: Float[Array, "M M"]) -> Float[Array, "M M"]:

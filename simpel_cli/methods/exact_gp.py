@@ -1,0 +1,156 @@
+"""Exact Gaussian process with the calibrated simulator as its mean: cheap, strong, and no network.
+
+    y = g(x, phi_hat) + h~(x) + noise,    h~ ~ GP(0, kappa^2 rho(|x - x'|/l)) in closed form
+
+kappa is that of the prior, chosen by marginal likelihood unless it is declared; the noise is the one that maximises the
+marginal likelihood with it.
+
+Reference: Rasmussen and Williams (2006), eqs. 2.25-2.26 and 5.8; Kennedy and O'Hagan (2001), Bayesian calibration of computer
+models.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.gp import gram
+from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.methods.sysid import SysID, identified, simulator_of
+from simpel_cli.predictive import Predictive
+
+NOISES = 41  # levels that are tried, from the floor to the targets' spread
+
+
+class State(NamedTuple):
+    """Everything that the training data say: parameters, spectrum of the correlation at the inputs, weights, noise."""
+
+    phi: Float[Array, " dp"]
+    values: Float[Array, " m"]
+    vectors: Float[Array, "m m"]
+    turned: Float[Array, "m dy"]  # residuals along the eigenvectors
+    noise_std: Float[Array, " dy"]
+    loss: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class ExactGP:
+    """Gaussian process about an identified simulator.
+
+    Args:
+        sysid: how the simulator is calibrated.
+        particles: of the mixture that stands for the Gaussian predictive, L: its quantiles.
+    """
+
+    sysid: SysID = SysID()
+    particles: int = 20
+
+    steps = 1  # not a field: there is nothing to iterate
+    uses_score = False  # nor to estimate
+
+    def __post_init__(self) -> None:
+        if self.particles < 2:
+            raise ConfigError(f"method.particles: got {self.particles}; it must be at least 2.")
+
+    @property
+    def pool(self) -> int:
+        """No points of the domain are looked at."""
+        return self.sysid.pool
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Observation noise."""
+        return self.sysid.noise
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+
+        Raises:
+            ConfigError: the prior has no gap process.
+        """
+        prior, run = simulator_of(setting)
+        if prior.kernel is None:
+            raise ConfigError("method: gp needs the gap process of prior=simulator; prior=simulator_only has none.")
+        kernel, scale, dtype = prior.kernel, problem.normaliser, problem.x.dtype
+        counts = (jnp.arange(problem.x.shape[0], dtype=jnp.int32) < problem.m).astype(jnp.float64)
+        kappa, floor, typical = (
+            jnp.asarray(a).astype(jnp.float64) for a in (problem.gap_scale, problem.noise_floor, problem.noise_init)
+        )
+
+        def simulated(phi: Float[Array, " dp"], x: Float[Numbers, "n dx"]) -> Float[Array, "n dy"]:
+            return (jax.vmap(run, in_axes=(0, None))(jnp.asarray(x), phi) - scale.y_mean[None]) / scale.y_std[None]
+
+        def scaled(x: Float[Numbers, "n dx"]) -> Float[Array, "n dx"]:
+            return (scale.x(x) * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
+
+        def likely(
+            kappa: Float[Array, ""], floor: Float[Array, ""], typical: Float[Array, ""], turned: Float[Array, " m"],
+            values: Float[Array, " m"],
+        ) -> tuple[Float[Array, ""], Float[Array, ""]]:  # fmt: skip
+            """Noise of one output with the largest penalised marginal likelihood, and minus its logarithm."""
+            levels = jnp.exp(jnp.linspace(jnp.log(floor), jnp.log(jnp.maximum(1.0, 2 * floor)), NOISES))
+            levels = levels if self.noise.learn else typical[None]
+
+            def minus(sigma: Float[Array, ""]) -> Float[Array, ""]:
+                total = kappa**2 * values + sigma**2 + prior.white_variance
+                # padding has eigenvalue 0 and no residual: its log determinant is taken off
+                empty = (counts.shape[0] - jnp.sum(counts)) * jnp.log(sigma**2 + prior.white_variance)
+                data = 0.5 * jnp.sum(turned**2 / total + jnp.log(total)) - 0.5 * empty
+                return data + 0.5 * (jnp.log(sigma / typical) / self.noise.prior_std) ** 2
+
+            losses = jax.vmap(minus)(levels)
+            best = jnp.argmin(losses)
+            return levels[best], losses[best]
+
+        def init(key: PRNGKeyArray) -> State:
+            phi = identified(self.sysid, setting, problem, key)
+            known = scaled(problem.x)
+            values, vectors = jnp.linalg.eigh(gram(kernel, known, known) * counts[:, None] * counts[None])
+            values = jnp.maximum(values, 0.0)
+            left = (jnp.asarray(problem.y) - simulated(phi, problem.x)).astype(jnp.float64) * counts[:, None]
+            turned = vectors.T @ left
+            sigma, loss = jax.vmap(likely, in_axes=(0, 0, 0, 1, None))(kappa, floor, typical, turned, values)
+            whole = jnp.sum(loss) / problem.m.astype(jnp.float64)
+            return State(phi, values, vectors, turned, sigma.astype(dtype), whole.astype(dtype))
+
+        def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
+            return state, Info(state.loss, state.noise_std, jnp.zeros((), dtype))
+
+        def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
+            """Mean and standard deviation of the function, normalised."""
+            reach = (gram(kernel, scaled(x), scaled(problem.x)) * counts[None]) @ state.vectors
+
+            def of_output(
+                kappa: Float[Array, ""], sigma: Float[Array, ""], turned: Float[Array, " m"]
+            ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+                total = kappa**2 * state.values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
+                taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
+                std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + prior.white_variance)
+                return kappa**2 * (reach @ (turned / total)), std
+
+            mean, std = jax.vmap(of_output, in_axes=(0, 0, 1), out_axes=1)(kappa, state.noise_std, state.turned)
+            return simulated(state.phi, x) + mean.astype(dtype), std.astype(dtype)
+
+        def quantiles() -> Float[Array, "L dy"]:
+            """Standard normal quantiles of unit variance, in another order for every output, so that they are independent."""
+            q = jax.scipy.stats.norm.ppf((jnp.arange(self.particles, dtype=dtype) + 0.5) / self.particles)
+            q = q / jnp.sqrt(jnp.mean(q**2))
+            keys = jax.random.split(jax.random.key(0), problem.y.shape[1])
+            return jnp.stack([jax.random.permutation(key, q) for key in keys], axis=1)
+
+        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
+            mean, std = predicted(state, x)
+            h = mean[None] + quantiles()[:, None] * std[None]
+            return Predictive(scale.y_to_data(h), state.noise_std * scale.y_std)
+
+        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
+            def one(x: Float[Array, "n dx"], q: Float[Array, " dy"]) -> Float[Array, "n dy"]:
+                mean, std = predicted(state, x)
+                return mean + q[None] * std
+
+            return scale.y_to_data(jax.vmap(one)(x, quantiles()))
+
+        return Inference(init, lambda key: None, step, predict, members)

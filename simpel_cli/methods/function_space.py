@@ -1,0 +1,217 @@
+"""Inference in function space: particles are networks, moved by what their function values should do.
+
+On a measurement set X of k points (a data batch and fresh points of the domain), a rule (`fsvgd`, `fmap`, `repulsive`) turns
+function values h_l in R^(k dy) and scores into velocities of function values,
+
+    s_l = grad_{h_l} { (m/b) sum_batch log N(y; h_l(x), sigma^2) + log p(h_l^X) },
+
+and the weights follow by the vector-Jacobian product. The score is that of the joint log posterior: the same prior weighs
+the same under every estimator and rule.
+
+Reference: Wang, Ren, Zhu and Zhang (2019), Function space particle optimization for Bayesian neural networks, eq. 5; Treven et
+al., Simulation priors (SimPEL).
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
+from simpel_cli.nets import MLP, Particles
+from simpel_cli.predictive import Predictive
+
+LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
+
+
+class State(NamedTuple):
+    """L networks, the noise parameter, and the optimiser's state of both."""
+
+    particles: Particles
+    noise: Float[Array, " dy"]
+    optimiser: optax.OptState
+
+
+class Draws(NamedTuple):
+    """Points of the domain and prior draws at them and at the training inputs, shared by a stretch of steps."""
+
+    x: Float[Array, "B dx"]
+    samples: Float[Array, "B dy N"]
+
+
+@dataclass(frozen=True)
+class FunctionSpace(ABC):
+    """Particles in function space, with AdamW; a rule is a subclass with a velocity.
+
+    Args:
+        steps: number of SVGD steps.
+        particles: number of networks, L.
+        network: architecture.
+        learning_rate: of AdamW, at the start.
+        final_learning_rate: fraction of it that is left at the last step, along a cosine; 1 = constant. A constant rate
+            leaves the particles jittering about the posterior, which the learned noise then takes for noise.
+        weight_decay: of AdamW, on network weights only.
+        batch: training points per step, at most; drawn without replacement.
+        fresh_points: points of the domain per step.
+        pool: points of the domain that a stretch of steps chooses from; a power of two.
+        prior_weight: exponent of the prior; 1 is Bayes.
+        noise: observation noise.
+    """
+
+    steps: int = 5000
+    particles: int = 20
+    network: MLP = MLP()
+    learning_rate: float = 3e-3
+    final_learning_rate: float = 0.03
+    weight_decay: float = 1e-3
+    batch: int = 8
+    fresh_points: int = 32
+    pool: int = 256
+    prior_weight: float = 1.0
+    noise: NoiseModel = NoiseModel()
+
+    uses_score = True  # not a field
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "particles", "batch", "fresh_points", "pool"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        if self.pool & (self.pool - 1) or self.pool < self.fresh_points:
+            raise ConfigError(
+                f"method.pool: got {self.pool}; it must be a power of two and at least fresh_points ({self.fresh_points})."
+            )
+        if not self.learning_rate > 0:
+            raise ConfigError(f"method.learning_rate: got {self.learning_rate}; it must be positive.")
+
+    @abstractmethod
+    def velocity(
+        self, h: Float[Array, "L *d"], score: Float[Array, "L *d"]
+    ) -> tuple[Float[Array, "L *d"], Float[Array, ""]]:
+        """Return where function values of L particles go, and how near the particles are: the mean kernel between two."""
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
+        to_normalised = problem.normaliser
+        dtype = problem.x.dtype
+        n_rows, dim_x = problem.x.shape
+        dim_y = problem.y.shape[1]
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
+        optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
+
+        def noise_std(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+            return self.noise.std(rho, problem.noise_floor)
+
+        def init(key: PRNGKeyArray) -> State:
+            keys = jax.random.split(key, self.particles)
+            particles = jax.vmap(lambda k: self.network.init(k, dim_x, dim_y, dtype))(keys)
+            noise = self.noise.init(problem.noise_init, problem.noise_floor)
+            return State(particles, noise, optimiser.init((particles, noise)))
+
+        def draw(key: PRNGKeyArray) -> Draws:
+            if problem.bank is not None:
+                x, samples = jnp.asarray(problem.bank.x), jnp.asarray(problem.bank.samples)
+            else:
+                key_x, key_phi = jax.random.split(key)
+                fresh = setting.sample_inputs(key_x, self.pool)
+                x = jnp.concatenate([jnp.asarray(problem.x), fresh])
+                samples = jnp.moveaxis(setting.prior.simulate(key_phi, x, setting.prior.draws), 0, -1)
+            scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
+            return Draws(to_normalised.x(x), scaled)
+
+        def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Bool[Array, " b"], Int[Array, " k"]]:
+            """Rows of the batch, which of them are data, and rows of the bank: the batch and distinct fresh points."""
+            key_batch, key_offset, key_stride = jax.random.split(key, 3)
+            batch, is_data = distinct_rows(key_batch, min(self.batch, n_rows), jnp.asarray(problem.m))
+            # an odd stride visits a power of two of rows without repeats: distinct points without a sort
+            b, kind = batch.shape[0], batch.dtype
+            offset = jax.random.randint(key_offset, (), 0, self.pool, kind)
+            stride = 2 * jax.random.randint(key_stride, (), 0, max(self.pool // 2, 1), kind) + 1
+            fresh = n_rows + (offset + stride * jnp.arange(b + self.fresh_points, dtype=kind)) % self.pool
+            # fresh points fill the batch where there are fewer data than it has room for
+            return batch, is_data, fresh.at[:b].set(jnp.where(is_data, batch, fresh[:b]))
+
+        def step(key: PRNGKeyArray, state: State, draws: Draws) -> tuple[State, Info]:
+            key_points, key_gap = jax.random.split(key)
+            batch, is_data, rows = measurement_set(key_points)
+            b, counted = batch.shape[0], is_data.astype(dtype)
+            x, y = draws.x[rows], problem.y[batch]
+            h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
+
+            weight = problem.m.astype(dtype) / jnp.sum(counted)
+            fit, (score_data, score_noise) = jax.value_and_grad(
+                lambda h, rho: log_likelihood(h, noise_std(rho), y, counted), argnums=(0, 1)
+            )(h[:, :b], state.noise)
+            score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
+            score = score.at[:, :b].add(weight * score_data)
+            velocity, mean_kernel = self.velocity(h, score)
+
+            (ascent,) = pull_back(velocity)
+            # the noise is shared by the particles: its gradient is averaged over them
+            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init, problem.noise_floor)
+            ascent_noise = weight * score_noise / self.particles + noise_prior if self.noise.learn else 0 * state.noise
+            descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
+            with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
+                updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
+            particles = optax.apply_updates(state.particles, updates[0])
+            noise = state.noise + self.noise.rate * updates[1]
+            info = Info(-fit / (jnp.sum(counted) * self.particles), noise_std(state.noise), mean_kernel)
+            return State(particles, noise, opt_state), info
+
+        def prior_score(
+            key: PRNGKeyArray, h: Float[Array, "L k dy"], samples: Float[Array, "k dy N"], x: Float[Array, "k dx"]
+        ) -> Float[Array, "L k dy"]:
+            covariance = setting.prior.covariance(x, problem.gap_scale)
+            gap = None
+            if setting.score.gap_draws:
+                # a prior without a simulator brings two draws, both zero: enough for moments, not for an estimate
+                samples = jnp.tile(samples, (1, 1, -(-LEAST_DRAWS // samples.shape[2])))
+                factor = jnp.linalg.cholesky(covariance.astype(jnp.float64)).astype(dtype)
+                gap = jnp.einsum("dkj,jdn->kdn", factor, jax.random.normal(key, samples.shape, dtype))
+
+            def estimate(h: Array, s: Array, c: Array, g: Array | None) -> Array:
+                return setting.score(h, s.T, c, None if g is None else g.T)
+
+            every = jax.vmap(estimate, in_axes=(2, 1, 0, None if gap is None else 1), out_axes=2)
+            return every(h, samples, covariance, gap)
+
+        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
+            h = self.network.apply_all(state.particles, to_normalised.x(x))
+            return Predictive(to_normalised.y_to_data(h), noise_std(state.noise) * to_normalised.y_std)
+
+        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
+            return to_normalised.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(to_normalised.x)(x)))
+
+        return Inference(init, draw, step, predict, members)
+
+
+def distinct_rows(key: PRNGKeyArray, size: int, m: Int[Array, ""]) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:
+    """Draw `size` distinct rows out of m, without a sort; of fewer rows than that, all of them once.
+
+    Returns:
+        Rows, and which of them count: where m < size, entry i is row i and counts if i < m.
+
+    Reference: Floyd's algorithm, in Bentley and Floyd (1987), A sample of brilliance.
+    """
+    entry = jnp.arange(size, dtype=m.dtype)
+    last = jnp.maximum(m - size, 0) + entry  # entry i is drawn from the rows up to this one
+    drawn = jax.random.randint(key, (size,), 0, last + 1, m.dtype)
+
+    def choose(i: Int[Array, ""], rows: Int[Array, " size"]) -> Int[Array, " size"]:
+        return rows.at[i].set(jnp.where(jnp.any(rows == drawn[i]), last[i], drawn[i]))
+
+    rows = jax.lax.fori_loop(0, size, choose, jnp.full(size, -1, m.dtype))
+    enough = m >= size
+    return jnp.where(enough, rows, entry), enough | (entry < m)
+
+
+def log_likelihood(
+    h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"], counted: Float[Array, " b"]
+) -> Float[Array, ""]:
+    """Return the sum over particles, counted points and outputs of log N(y; h, sigma^2), up to a constant."""
+    z = (y[None] - h) / sigma[None, None]
+    return jnp.sum((-0.5 * z * z - jnp.log(sigma)[None, None]) * counted[None, :, None])

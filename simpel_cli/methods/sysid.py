@@ -1,0 +1,211 @@
+"""System identification: the parameters of the simulator, most probable under their prior, with Laplace intervals.
+
+    f(u, rho) = 1/2 sum_jk (y_jk - g_k(x_j, phi(u)))^2 / sigma_k^2 + m sum_k log sigma_k - log p(u) - log p(rho)
+
+by damped Fisher scoring from several draws of the prior, within the bounds of uniform priors. Effects that the simulator
+lacks stay absent: what is left is noise to it.
+
+Reference: Levenberg (1944), Marquardt (1963); MacKay (1992), A practical Bayesian framework for backpropagation networks,
+sec. 2 (the Gaussian about the optimum).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
+from simpel_cli.predictive import Predictive
+from simpel_cli.prior import FunctionPrior
+from simpel_cli.transition import OneStep
+
+FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
+EASIER, HARDER = 0.3, 5.0  # what the damping is multiplied by
+FAR = 6.0  # standard deviations of a normal prior that a parameter may go
+
+
+class State(NamedTuple):
+    """Every start of the search: unit coordinates, noise, damping, and the loss there."""
+
+    u: Float[Array, "S dp"]
+    rho: Float[Array, "S dy"]
+    damping: Float[Array, " S"]
+    loss: Float[Array, " S"]
+
+
+@dataclass(frozen=True)
+class SysID:
+    """Maximum a posteriori simulator with Laplace intervals.
+
+    Args:
+        steps: of the search; each is one simulation of the training data and its derivatives per start.
+        starts: beginnings, draws of the prior; the best end counts.
+        particles: draws of the Gaussian about the optimum that a prediction is a mixture of, L.
+        noise: observation noise.
+    """
+
+    steps: int = 200
+    starts: int = 8
+    particles: int = 20
+    noise: NoiseModel = NoiseModel()
+
+    pool = 1  # not a field: no points of the domain are looked at
+    uses_score = False  # nor is the prior over functions, but for its parameters
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "starts", "particles"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+
+        Raises:
+            ConfigError: there is no simulator in symbols to identify.
+        """
+        prior, run = simulator_of(setting)
+        if not prior.params:
+            raise ConfigError(
+                "method: sysid has nothing to identify; give a parameter of the simulator a range (sim.parameters.X.range)."
+            )
+        scale, dtype = problem.normaliser, problem.x.dtype
+        dim_u, dim_y, n_rows = len(prior.params), problem.y.shape[1], problem.x.shape[0]
+        low, high = (jnp.asarray(side, dtype) for side in bounds(prior))
+        gaussian = jnp.asarray([q.prior != "uniform" for q in prior.params], bool)
+        counts = (jnp.arange(n_rows, dtype=jnp.int32) < problem.m).astype(dtype)[:, None]
+
+        def simulated(u: Float[Array, " dp"], x: Float[Array, "n dx"]) -> Float[Array, "n dy"]:
+            y = jax.vmap(run, in_axes=(0, None))(x, physical(prior, u))
+            return (y - scale.y_mean[None]) / scale.y_std[None]
+
+        def sigma(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+            return self.noise.std(rho, problem.noise_floor)
+
+        def loss(u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
+            e = (problem.y - simulated(u, jnp.asarray(problem.x))) / sigma(rho)[None]
+            data = jnp.sum(counts * (0.5 * e**2 + jnp.log(sigma(rho))[None]))
+            learned = self.noise.log_prior(rho, problem.noise_init, problem.noise_floor) if self.noise.learn else 0.0
+            return data + 0.5 * jnp.sum(jnp.where(gaussian, u**2, 0.0)) - learned
+
+        def fisher(u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, "d d"]:
+            """Information of unit coordinates and noise."""
+            slope = jax.jacfwd(simulated)(u, jnp.asarray(problem.x)) / sigma(rho)[None, :, None]
+            of_u = jnp.einsum("nki,nkj->ij", slope * counts[:, :, None], slope) + jnp.diag(gaussian.astype(dtype))
+            of_log = 2 * problem.m.astype(dtype) + 1 / self.noise.prior_std**2
+            bend = jax.nn.sigmoid(rho) / sigma(rho)  # d log sigma / d rho
+            return jax.scipy.linalg.block_diag(of_u, jnp.diag(of_log * bend**2))
+
+        def better(state: State) -> State:
+            """One damped step of one start."""
+            at = jnp.concatenate([state.u, state.rho])
+            slope = jnp.concatenate(jax.grad(loss, argnums=(0, 1))(state.u, state.rho))
+            edge = (
+                jnp.concatenate([low, jnp.full((dim_y,), -jnp.inf, dtype)]),
+                jnp.concatenate([high, jnp.full((dim_y,), jnp.inf, dtype)]),
+            )
+            stuck = ((at <= edge[0]) & (slope > 0)) | ((at >= edge[1]) & (slope < 0))
+            still = stuck | (jnp.arange(at.shape[0]) >= dim_u) if not self.noise.learn else stuck
+            moves = jnp.where(still, 0.0, 1.0).astype(dtype)
+            h = fisher(state.u, state.rho) * moves[:, None] * moves[None]
+            h = h + jnp.diag(state.damping * jnp.diag(h) + jnp.where(still, 1.0, 1e-9 * jnp.trace(h) + 1e-12))
+            new = jnp.clip(at - jnp.linalg.solve(h, slope * moves), *edge)
+            value = loss(new[:dim_u], new[dim_u:])
+            good = jnp.isfinite(value) & (value < state.loss)
+            here = jnp.where(good, new, at)
+            damping = jnp.clip(state.damping * jnp.where(good, EASIER, HARDER), 1e-9, MOST_DAMPING)
+            return State(here[:dim_u], here[dim_u:], damping.astype(dtype), jnp.where(good, value, state.loss))
+
+        def init(key: PRNGKeyArray) -> State:
+            random = jax.random.uniform(key, (self.starts, dim_u), dtype, 0.05, 0.95)
+            u = jnp.where(gaussian[None], jax.scipy.stats.norm.ppf(random), random).astype(dtype)
+            u = u.at[0].set(jnp.where(gaussian, 0.0, 0.5))  # one from the middle
+            rho = jnp.tile(self.noise.init(problem.noise_init, problem.noise_floor)[None], (self.starts, 1)).astype(
+                dtype
+            )
+            first = jax.vmap(loss)(u, rho)
+            damping = jnp.full((self.starts,), FIRST_DAMPING, dtype)
+            return State(u, rho, damping, jnp.where(jnp.isfinite(first), first, jnp.inf))
+
+        def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
+            after = jax.vmap(better)(state)
+            best = jnp.argmin(after.loss)
+            info = Info(after.loss[best] / problem.m.astype(dtype), sigma(after.rho[best]), jnp.zeros((), dtype))
+            return after, info
+
+        def drawn(state: State) -> tuple[Float[Array, "L dp"], Float[Array, " dy"]]:
+            """Unit coordinates from the Gaussian about the best optimum, within bounds, and the noise."""
+            best = jnp.argmin(state.loss)
+            u, rho = state.u[best], state.rho[best]
+            # a uniform prior knows its variance of 1/12: where data see nothing, a draw is spread over the range
+            h = fisher(u, rho)[:dim_u, :dim_u] + jnp.diag(jnp.where(gaussian, 0.0, 12.0).astype(dtype))
+            held = (u <= low) | (u >= high)  # at a bound half of the mass lies beyond it: the optimum stands for it
+            h = jnp.where(held[:, None] | held[None], jnp.eye(dim_u, dtype=dtype), h)
+            factor = jnp.linalg.cholesky(h.astype(jnp.float64)).astype(dtype)
+            white = jax.random.normal(jax.random.key(0), (self.particles, dim_u), dtype)
+            white = (white - jnp.mean(white, axis=0)[None]) * (self.particles / max(self.particles - 1, 1)) ** 0.5
+            apart = jax.scipy.linalg.solve_triangular(factor, white.T, lower=True, trans=1).T
+            apart = jnp.where(held[None], 0.0, apart)
+            # a draw beyond a bound is shortened along its own direction: clipped, it would leave a ridge of parameters that
+            # fit equally well
+            room = jnp.where(apart > 0, (high - u)[None], (u - low)[None]) / jnp.maximum(jnp.abs(apart), 1e-12)
+            return u[None] + jnp.minimum(jnp.min(room, axis=1, initial=1.0), 1.0)[:, None] * apart, sigma(rho)
+
+        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
+            u, noise_std = drawn(state)
+            h = jax.vmap(simulated, in_axes=(0, None))(u, x)
+            return Predictive(scale.y_to_data(h), noise_std * scale.y_std)
+
+        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
+            return scale.y_to_data(jax.vmap(simulated)(drawn(state)[0], x))
+
+        return Inference(init, lambda key: None, step, predict, members)
+
+
+def identified(method: SysID, setting: Setting, problem: Problem, key: PRNGKeyArray) -> Float[Array, " dp"]:
+    """Return the most probable parameters, in physical units; those of a simulator without uncertain ones are none."""
+    prior, _ = simulator_of(setting)
+    if not prior.params:
+        return jnp.zeros((0,), problem.x.dtype)
+    rule = method.bind(setting, problem)
+
+    def body(_: Array, state: State) -> State:
+        after: State = rule.step(key, state, None)[0]
+        return after
+
+    last: State = jax.lax.fori_loop(0, method.steps, body, rule.init(key))
+    return physical(prior, last.u[jnp.argmin(last.loss)])
+
+
+def simulator_of(setting: Setting) -> tuple[FunctionPrior, OneStep]:
+    """Return the prior and its simulator, which has to be one in symbols.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    prior = setting.prior
+    if not isinstance(prior, FunctionPrior) or prior.step is None:
+        raise ConfigError(
+            "method: this one calibrates the simulator's parameters; it needs prior=simulator (or simulator_only) and a "
+            "simulator declared in symbols, not a world."
+        )
+    return prior, prior.step
+
+
+def bounds(prior: FunctionPrior) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest unit coordinates, (dp,)."""
+    uniform = np.array([q.prior == "uniform" for q in prior.params], bool)
+    return np.where(uniform, 0.0, -FAR), np.where(uniform, 1.0, FAR)
+
+
+def physical(prior: FunctionPrior, u: Float[Array, " dp"]) -> Float[Array, " dp"]:
+    """Return parameters at unit coordinates: shares of a uniform range, standard deviations of a normal prior."""
+    values = []
+    for i, q in enumerate(prior.params):
+        low, high = (np.log([q.low, q.high]) if q.prior == "lognormal" else np.array([q.low, q.high])).tolist()
+        at = low + (high - low) * u[i] if q.prior == "uniform" else (low + high) / 2 + (high - low) / 4 * u[i]
+        values.append(jnp.exp(at) if q.prior == "lognormal" else at)
+    return jnp.stack(values).astype(u.dtype)
