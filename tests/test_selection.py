@@ -190,6 +190,17 @@ def test_a_function_that_does_better_than_a_name_leaves_it_where_it_still_earns_
     assert (found.remainder[1] if found.remainder else None) == pytest.approx(asked_for)
 
 
+def test_an_effect_stays_where_the_program_has_no_room_to_set_a_function_beside_it() -> None:
+    table = Table({"": 0.0, "A": 30.0, "?": 50.0, "A?": 51.0})
+    table.search.banned = set(sorted(table.search.banned)[1:])
+    (function,) = (t for t in table.search.candidates(()) if table.name(t) == "?")
+    table.width = len(table.search.free((function,)))
+    found = select(table.search)
+    assert [table.name(t) for t in found.chosen.terms] == ["A"]
+    assert found.remainder is not None
+    assert found.remainder[1] == pytest.approx(20.0)
+
+
 @pytest.mark.parametrize(
     ("worse_fit", "less_evidence", "tied"),
     [(0.0, TIE - 0.1, True), (SAME - 0.1, TIE + 9, True), (SAME + 0.1, TIE + 9, False), (SAME + 0.1, TIE - 0.1, True)],

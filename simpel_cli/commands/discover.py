@@ -265,7 +265,7 @@ def _of_two(
     if gone:
         told(f"beside it {' and '.join(gone)} is not needed")
         selection = cut(search, selection, found.kept)
-        judged = [judged[i] for i in found.kept if i < len(judged)]
+        judged = [judged[i] for i in found.kept]
     return selection._replace(remainder=(found.term, found.gain)), judged
 
 

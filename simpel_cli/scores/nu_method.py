@@ -71,7 +71,7 @@ class NuMethod:
     gap_draws = True
 
     def __post_init__(self) -> None:
-        radial.check(self.kernel, self.bandwidth)
+        radial.check(self.kernel, self.bandwidth, self.baseline)
         for name in ("wider", "weight", "nu"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"score.{name}: got {getattr(self, name)}; it must be positive.")
@@ -79,8 +79,6 @@ class NuMethod:
             raise ConfigError(f"score.regularisation: got {self.regularisation!r}; allowed are nu and tikhonov.")
         if self.centres < 2:
             raise ConfigError(f"score.centres: got {self.centres}; it must be at least 2.")
-        if self.baseline not in ("gaussian", "none"):
-            raise ConfigError(f"score.baseline: got {self.baseline!r}; allowed are gaussian and none.")
 
     def __call__(
         self,

@@ -53,7 +53,7 @@ def width(bandwidth: float | str, wider: float, x: Float[Array, "N M"]) -> Float
     return wider * jnp.sqrt(jnp.median(apart)) + jnp.finfo(x.dtype).tiny ** 0.5
 
 
-def check(kernel: str, bandwidth: float | str) -> None:
+def check(kernel: str, bandwidth: float | str, baseline: str) -> None:
     """Refuse what no estimator knows.
 
     Raises:
@@ -63,6 +63,8 @@ def check(kernel: str, bandwidth: float | str) -> None:
         raise ConfigError(f"score.kernel: got {kernel!r}; allowed are {' and '.join(KERNELS)}.")
     if (isinstance(bandwidth, str) and bandwidth != "median") or (not isinstance(bandwidth, str) and not bandwidth > 0):
         raise ConfigError(f"score.bandwidth: got {bandwidth!r}; allowed are median and a positive number.")
+    if baseline not in ("gaussian", "none"):
+        raise ConfigError(f"score.baseline: got {baseline!r}; allowed are gaussian and none.")
 
 
 def subspace(matrix: Float[Array, "P P"], rank: int, key: Array, passes: int = 2) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ class SSGE:
     gap_draws = True
 
     def __post_init__(self) -> None:
-        radial.check(self.kernel, self.bandwidth)
+        radial.check(self.kernel, self.bandwidth, self.baseline)
         if not 0 < self.share <= 1:
             raise ConfigError(f"score.share: got {self.share}; it must be above 0 and at most 1.")
         for name in ("rank", "landmarks"):
@@ -53,8 +53,6 @@ class SSGE:
                 raise ConfigError(f"score.{name}: got {getattr(self, name)}; it must be at least 1.")
         if not self.eta >= 0:
             raise ConfigError(f"score.eta: got {self.eta}; it must be at least 0.")
-        if self.baseline not in ("gaussian", "none"):
-            raise ConfigError(f"score.baseline: got {self.baseline!r}; allowed are gaussian and none.")
 
     def __call__(
         self,
