@@ -16,6 +16,8 @@ from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.coordinates import CUT
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.interactions import BASES, carried, names_of
+from simpel_cli.discovery.levels import Levels
+from simpel_cli.discovery.remainder import remainder_of
 from simpel_cli.discovery.search import Search
 from simpel_cli.discovery.selection import Selection, cut, select
 from simpel_cli.discovery.sensitivity import shifts, waves
@@ -109,7 +111,7 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
     selection, gates, _ = _gated(search, assessor, select(search), terminal)
-    left, gates = _of_two(search, assessor, selection, gates, attach, Discovery(), terminal)
+    left, gates = _of_two(Levels(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal)
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left
 
@@ -117,7 +119,8 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
 def said(data: Recording, search: Search, assessor: Assessor, left: Selection) -> dict[str, Any]:
     windows = windows_of_tests(search.plan, data.test, ())
     before, learnt = (assessor(left.chosen.optimum.z, w) for w in (windows, search.plan.windows))
-    return verdict_of(search, left, [], before, before, learnt, windows, data.checks, 10, 0.0)
+    left_over = remainder_of(search, left, None, learnt)
+    return verdict_of(search, left, [], before, before, left_over, windows, data.checks, 10, 0.0)
 
 
 def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> None:

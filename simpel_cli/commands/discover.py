@@ -22,8 +22,10 @@ from simpel_cli.discovery.exhibits import exhibits
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.gate import Gate, gates
 from simpel_cli.discovery.interactions import interaction
+from simpel_cli.discovery.levels import Levels
 from simpel_cli.discovery.next_experiment import next_experiment
 from simpel_cli.discovery.outliers import gated, without_new
+from simpel_cli.discovery.remainder import remainder_of
 from simpel_cli.discovery.residual import Forces
 from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.discovery.selection import Selection, cut, refused, select
@@ -31,6 +33,7 @@ from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
 from simpel_cli.discovery.starts import begun, moved
+from simpel_cli.discovery.swings import swing
 from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
@@ -105,7 +108,13 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     terminal.line(outliers.detail, "outliers")
     recording = recording._replace(checks=(*recording.checks, outliers))
     selection, judged = _selected(search, assessor, base, options, terminal)
-    selection, judged = _of_two(search, assessor, selection, judged, attach, options, terminal)
+    levels = Levels(search, assessor, selection.chosen)
+    selection, judged = _of_two(levels, selection, judged, attach, options, terminal)
+    swinging = None if selection.remainder else swing(levels)
+    if swinging is not None:
+        terminal.line(
+            f"a force on {swinging.acts_on} that swings in {swinging.period:.3g} s +{swinging.gain:.0f}", "search"
+        )
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,
@@ -113,7 +122,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         judged,
         before,
         after,
-        assessor(selection.chosen.optimum.z, search.plan.windows),
+        remainder_of(search, selection, swinging, assessor(selection.chosen.optimum.z, search.plan.windows)),
         windows,
         recording.checks,
         options.horizon,
@@ -239,8 +248,7 @@ def _gated(
 
 
 def _of_two(
-    search: Search,
-    assessor: Assessor,
+    levels: Levels,
     selection: Selection,
     judged: list[Gate],
     attach: Callable[..., Setup],
@@ -250,7 +258,7 @@ def _of_two(
     """Look once more whether what is left is a function of two arguments."""
     known = selection.remainder[1] if selection.remainder else 0.0
     told = lambda text: terminal.line(text, "search")  # noqa: E731
-    found = interaction(search, assessor, selection.chosen, attach, options.lanes, told, known)
+    found = interaction(levels, attach, options.lanes, told, known)
     if found is None:
         return selection, judged
     _told(
@@ -261,10 +269,10 @@ def _of_two(
     )
     if not found.gate.passed:
         return selection, judged
-    gone = [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
+    gone = [levels.search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
     if gone:
         told(f"beside it {' and '.join(gone)} is not needed")
-        selection = cut(search, selection, found.kept)
+        selection = cut(levels.search, selection, found.kept)
         judged = [judged[i] for i in found.kept]
     return selection._replace(remainder=(found.term, found.gain)), judged
 

@@ -13,8 +13,9 @@ import numpy as np
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter, Lane
 from simpel_cli.discovery.gate import Gate, gates
+from simpel_cli.discovery.levels import Levels
 from simpel_cli.discovery.promising import Promise, promised
-from simpel_cli.discovery.search import ACCEPT, Search, Trial
+from simpel_cli.discovery.search import ACCEPT, Search
 from simpel_cli.discovery.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 
@@ -41,9 +42,7 @@ class Interaction(NamedTuple):
 
 
 def interaction(
-    search: Search,
-    assessor: Assessor,
-    chosen: Trial,
+    levels: Levels,
     attach: Callable[..., Setup],
     lanes: int,
     told: Callable[[str], None] = lambda _: None,
@@ -52,20 +51,19 @@ def interaction(
     """Return the function of two arguments that the data ask for beside the chosen terms; None where there is none.
 
     Args:
-        search: that was run.
-        assessor: of its models.
-        chosen: the model that it ended with.
+        levels: of the model that a search ended with.
         attach: (kept, extra) -> the setup of a program with these terms alone.
         lanes: fits that run side by side.
         told: is told what goes on.
         known: evidence that a function of one argument earns there, which one of two has to beat, nats.
     """
+    search, assessor, chosen = levels.search, levels.assessor, levels.chosen
     model = search.plan.augmented.model
     if len(model.states) + len(model.inputs) > MOST_ARGUMENTS:
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
     terms = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
-    going = _worth_a_fit(promised(search, assessor, chosen, terms), terms, known + ACCEPT)
+    going = _worth_a_fit(promised(levels, terms), terms, known + ACCEPT)
     if not going:
         return None
     told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))

@@ -7,13 +7,12 @@ import numpy as np
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
+from simpel_cli.discovery.remainder import noise_of
 from simpel_cli.discovery.search import Search, Trial, asked
 from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.twins import twins
-from simpel_cli.discovery.whiteness import memory
 from simpel_cli.discovery.windows import Windows
-from simulators.effects.expression import per
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
@@ -27,7 +26,7 @@ def verdict_of(
     gates: list[Gate],
     before: Assessment,
     after: Assessment,
-    learnt: Assessment,
+    remainder: dict[str, Any] | None,
     windows: Windows,
     checks: tuple[Check, ...],
     horizon: int,
@@ -41,7 +40,7 @@ def verdict_of(
         gates: one per chosen term, in order.
         before: the calibrated simulator on the test windows.
         after: the corrected one.
-        learnt: the corrected one on the windows that it was fitted to.
+        remainder: what is left unexplained (`remainder_of`).
         windows: the test windows.
         checks: of the data.
         horizon: rows.
@@ -49,7 +48,6 @@ def verdict_of(
     """
     chosen = selection.chosen
     effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i in range(len(chosen.terms))]
-    remainder = _remainder(search, selection) or _followed(search, chosen, learnt)
     different = [_distinct(e) for e in effects]
     if not effects:
         kind = UNEXPLAINED if remainder else NONE
@@ -74,10 +72,10 @@ def verdict_of(
             "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
             "horizon_steps": horizon,
         },
-        "noise_floor": dict(zip(measured, _noise(search, chosen)[0], strict=True)),
+        "noise_floor": dict(zip(measured, noise_of(search, chosen)[0], strict=True)),
         "process_noise": {
-            "before": _noise(search, selection.base)[1],
-            "after": _noise(search, chosen)[1],
+            "before": noise_of(search, selection.base)[1],
+            "after": noise_of(search, chosen)[1],
             "share_after": _shaken(search, chosen),
         },
         "gate": [g._asdict() for g in gates],
@@ -130,8 +128,8 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         for t, _ in others
     ]
     places = {m["name"]: m["acts_on"] for m in members[::-1]}
-    before = _noise(search, selection.base)[1]
-    after = _noise(search, selection.chosen)[1]
+    before = noise_of(search, selection.base)[1]
+    after = noise_of(search, selection.chosen)[1]
     return {
         "name": term.effect,
         "acts_on": term.acts_on,
@@ -163,68 +161,11 @@ def _labels(effect: dict[str, Any], members: list[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(f"{name} on {place}" if several else name for name, several, place in words))
 
 
-def _remainder(search: Search, selection: Selection) -> dict[str, Any] | None:
-    if selection.remainder is None:
-        return None
-    term, gain = selection.remainder
-    scale = search.plan.scales.rate[term.acts_on]
-    level = _noise(search, selection.chosen)[1]
-    unit = term.knobs[0].unit
-    return {
-        "acts_on": term.acts_on,
-        "depends_on": list(term.depends_on),
-        "rms": level / np.sqrt(search.plan.augmented.model.dt),
-        "unit": unit,
-        "log_evidence_gain": gain,
-        "description": f"something acts on d({term.acts_on})/dt that depends on {', '.join(term.depends_on)} and is "
-        f"no effect of the catalogue (typical rate of the data: {scale:.3g} {unit})",
-    }
-
-
-def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, Any] | None:
-    """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
-    errors = learnt.one_step / np.sqrt(learnt.variance)
-    found = {
-        name: told
-        for j, name in enumerate(search.plan.augmented.measured)
-        if (told := memory(errors[:, :, j])) is not None
-    }
-    if not found:
-        return None
-    worst = max(found, key=lambda name: abs(found[name][0]))
-    r, lag = found[worst]
-    apart = "from row to row" if lag == 1 else f"between rows that are {lag} apart"
-    model, roles = search.plan.augmented.model, search.plan.augmented.roles
-    speed = {position: velocity for velocity, position in roles.velocity.items() if position}
-    acts_on = speed.get(worst, worst)
-    unit = next((per(q.unit, "s") for q in model.states if q.name == acts_on), "")
-    return {
-        "acts_on": acts_on,
-        "depends_on": ["time"],
-        "rms": _noise(search, chosen)[1] / np.sqrt(model.dt),
-        "unit": unit,
-        "log_evidence_gain": None,
-        "description": f"something acts on d({acts_on})/dt that is no function of the states and inputs of the model: the "
-        f"one-step errors of {worst} have a memory (correlation {r:.2f} {apart}); it depends on time, or on what was not "
-        "recorded",
-    }
-
-
 def _parameters(search: Search, base: Trial, chosen: Trial) -> dict[str, Any]:
     return {
         q.name: {"before": interval_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
         for i, q in enumerate(search.plan.augmented.model.params)
     }
-
-
-def _noise(search: Search, trial: Trial) -> tuple[list[float], float]:
-    """Measurement noise per channel, and the largest process noise, per square root of a second."""
-    n_p, n_r, n_q = search.plan.coordinates.sizes
-    r, q = (
-        [search.plan.coordinates.value(i, trial.optimum.z[i]) for i in rows]
-        for rows in (range(n_p, n_p + n_r), range(n_p + n_r, n_p + n_r + n_q))
-    )
-    return r, max(q, default=0.0)
 
 
 def _shaken(search: Search, trial: Trial) -> float:

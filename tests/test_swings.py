@@ -1,0 +1,85 @@
+"""Forces that go with time: found with their period, and neither process noise nor a friction is taken for one."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from test_discovery_filter import DT
+from test_interactions import FRICTION, NOISE, ROWS
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.assess import Assessor
+from simpel_cli.discovery.fit import Fitter
+from simpel_cli.discovery.levels import Levels, evidence
+from simpel_cli.discovery.remainder import remainder_of
+from simpel_cli.discovery.search import Search
+from simpel_cli.discovery.selection import select
+from simpel_cli.discovery.setup import setup
+from simpel_cli.discovery.swings import swing
+from simulators.model import Declared
+
+PERIOD = 0.9  # s
+
+
+def test_evidence_is_that_of_a_linear_model_with_normal_weights() -> None:
+    random = np.random.default_rng(0)
+    columns, error = random.normal(size=(7, 3)), random.normal(size=7)
+    found = evidence(columns.T @ columns, columns.T @ error, np.array([0.2, 2.0]))
+    none = multivariate_normal(np.zeros(7), np.eye(7)).logpdf(error)
+    wanted = [
+        multivariate_normal(np.zeros(7), np.eye(7) + a**2 * columns @ columns.T).logpdf(error) - none
+        for a in (0.2, 2.0)
+    ]
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+    assert evidence(np.full((1, 1), np.nan), np.zeros(1), np.ones(2)).tolist() == [-np.inf, -np.inf]
+
+
+def pushed(force: Callable[[float, float, float], float], shaken: float, seed: int) -> Levels:
+    """Search episodes of dv/dt = 1.3 u - 0.7 v + force(t, phase, v), each with its own phase, by a simulator without it."""
+    random, fine, episodes = np.random.default_rng(seed), 20, []
+    for k in range(5):
+        s, v, phase = random.normal(), random.normal(), random.uniform(0, 2 * np.pi)
+        states, inputs = [], 2 * random.normal(size=ROWS).repeat(2)[:ROWS]
+        for i, u in enumerate(inputs):
+            states.append([s, v])
+            for j in range(fine):
+                t = (i + j / fine) * DT
+                s += v * DT / fine
+                v += (1.3 * u - 0.7 * v + force(t, phase, v)) * DT / fine + shaken * np.sqrt(
+                    DT / fine
+                ) * random.normal()
+        measured = np.array(states) + NOISE * random.normal(size=(ROWS, 2))
+        episodes.append(Episode(f"{k}", np.arange(ROWS) * DT, measured, inputs[:, None], np.zeros((ROWS, 0))))
+    checks = (Check("c", True, ""),)
+    data = Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"s": NOISE, "v": NOISE}, (), checks, ())
+    glider = Declared(
+        "glider", dt=DT,
+        states={"s": {"unit": "m", "range": [-9, 9]}, "v": {"unit": "m/s", "range": [-5, 5]}},
+        inputs={"u": {"unit": "V", "range": [-9, 9]}},
+        parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
+        dynamics={"s": "v", "v": "b*u - 0.7*v"},
+    ).model()  # fmt: skip
+    plan = setup(glider, data, (), [FRICTION], 2)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
+    return Levels(search, Assessor(plan, 10), select(search).chosen)
+
+
+@pytest.mark.parametrize("shaken", [0.0, 0.2])
+def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
+    levels = pushed(lambda t, phase, _: 0.5 * np.sin(2 * np.pi * t / PERIOD + phase), shaken, 0)
+    found = swing(levels)
+    assert found is not None
+    assert found.acts_on == "v"
+    assert found.period == pytest.approx(PERIOD, rel=0.1)
+    assert found.rms == pytest.approx(0.5 / np.sqrt(2), rel=0.3)
+    selection = select(levels.search)
+    learnt = levels.assessor(selection.chosen.optimum.z, levels.search.plan.windows)
+    told = remainder_of(levels.search, selection._replace(remainder=None), found, learnt)
+    assert told is not None
+    assert (told["depends_on"], told["period"], told["unit"]) == (["time"], found.period, "m/s^2")
+
+
+@pytest.mark.parametrize(("friction", "shaken"), [(0.0, 0.0), (0.0, 0.3), (0.4, 0.0)])
+def test_noise_and_a_named_friction_are_no_swings(friction: float, shaken: float) -> None:
+    assert swing(pushed(lambda _, __, v: -friction * v, shaken, 1)) is None
