@@ -28,7 +28,7 @@ from simpel_cli.discovery.outliers import gated, without_new
 from simpel_cli.discovery.remainder import remainder_of
 from simpel_cli.discovery.residual import Forces
 from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.selection import Selection, cut, refused, select
+from simpel_cli.discovery.selection import Selection, cut, further, refused, select
 from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
 from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
@@ -44,7 +44,7 @@ from simpel_cli.run import Manifest, make_directory, refuse_occupied
 from simulators.effects import Expression, Term
 from simulators.model import Model
 
-MOST_SEARCHES = 3  # each without the effects that did harm in those before
+MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
@@ -209,13 +209,14 @@ def _calibrated(
 def _selected(
     search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
 ) -> tuple[Selection, list[Gate]]:
-    """Search, and again without an effect that does harm: another one may be what it stood for."""
+    """Search, and go on without an effect that does harm: another one may be what it stood for."""
+    selection = select(search, base, options.beginnings)
     for _ in range(MOST_SEARCHES):
-        selection = select(search, base, options.beginnings)
         selection, judged, harmful = _gated(search, assessor, selection, terminal)
-        if not harmful:
-            break
         search.banned.update(harmful)
+        left, selection = selection, further(search, selection) if harmful else selection
+        if selection.chosen.terms == left.chosen.terms:
+            break
     return selection, judged
 
 

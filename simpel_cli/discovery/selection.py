@@ -65,6 +65,20 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
     grown = _grow(search, (base,))
     if beginnings and (len(grown.path) > 2 or grown.remainder):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(g.path[-1]))
+    return _settled(search, grown)
+
+
+def further(search: Search, found: Selection) -> Selection:
+    """Go on from what is left of a selection whose lost effects are candidates no more: another may take their place."""
+    grown = _grow(search, found.path)
+    stages = found.stages + grown.stages
+    if grown.path[-1].terms == found.chosen.terms:
+        return found._replace(stages=stages, remainder=found.remainder or grown.remainder)
+    return _settled(search, grown._replace(stages=stages))
+
+
+def _settled(search: Search, grown: _Grown) -> Selection:
+    """Drop what is not needed in the end, put one term in the place of two where one will do, and name the rivals."""
     stages = grown.stages
     for merger in range(MOST_MERGERS + 1):
         chosen, gains, without = search.prune(grown.path[-1])
