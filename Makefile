@@ -14,7 +14,8 @@ OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover exam lock data real clean reproduce-metrics_vs_n_train
+.PHONY: help install demo test test-slow lint format bench bench-discover exam lock data real clean reproduce-metrics_vs_n_train \
+	reproduce-sinusoids reproduce-bimodal
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -66,6 +67,12 @@ reproduce-metrics_vs_n_train: install ## Make the README's figure anew (36 fits)
 	$(BIN)/simpel sweep experiment=pendulum method=simpel,simpel_only_sim,fsvgd data.n_train=10,20,40,80 'run.seed=range(3)' \
 		hydra.sweep.dir=runs/reproduce/metrics_vs_n_train-$(shell date +%Y%m%d-%H%M%S)
 	@echo "the figure lies in runs/reproduce; the README shows docs/figures/metrics_vs_n_train.png"
+
+reproduce-sinusoids: install ## Make the paper's figure of sinusoids: five methods on two points (about 5 minutes)
+	$(BIN)/python -m tests.reproduce.sinusoids
+
+reproduce-bimodal: install ## Make the paper's figure of two modes: four score estimators (about 10 minutes)
+	$(BIN)/python -m tests.reproduce.bimodal
 
 lock: ## Write uv.lock against the public index only
 	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config

@@ -50,6 +50,12 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere }
 """
 
 FIGURES = {
+    "prior_predictive": (
+        "What the simulator expected",
+        "Training targets of the first seed among draws of the simulator with its ranges, at the same inputs, in the order of "
+        "the draws' medians. The dark band holds 90 % of the draws, the light one all of them. Targets outside no parameters "
+        "explain: the gap GP has to, or an effect that the simulator lacks (simpel discover).",
+    ),
     "learning_curves": ("Training", "A loss that still falls asks for more steps (method.steps)."),
     "predictions": (
         "Prediction against measurement",

@@ -9,13 +9,14 @@ import numpy as np
 
 from simpel_cli import loop
 from simpel_cli.commands.judge import Judged, judge
+from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
-from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, write_text
+from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, write_table, write_text
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
 LOG_EVERY = 50  # steps per row of the metric table
@@ -55,7 +56,10 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet, directory / "run.log")
     fitted = prepare(study)
-    describe(terminal, study, fitted)
+    checked = look_at_prior(study, fitted)
+    describe(terminal, study, fitted, checked)
+    if checked is not None:
+        write_table(directory / "prior_predictive.parquet", checked.table)
     start, state, fitted = _restored(directory, fitted) if resume else (0, None, fitted)
     program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
     constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}

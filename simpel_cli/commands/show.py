@@ -7,12 +7,14 @@ import numpy as np
 
 from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.commands.judge import Judged
+from simpel_cli.commands.prior_look import describe_prior
 from simpel_cli.commands.run_table import named_method
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.plots import draw_run
+from simpel_cli.prior_predictive import PriorCheck
 from simpel_cli.report import figure, write_report
 
 METRICS = {
@@ -31,7 +33,7 @@ NOTE = (
 )
 
 
-def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
+def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorCheck | None) -> None:
     """Say in a few lines what was understood."""
     s, recording, source = study.settings, study.recording, study.system.source
     seeds = f"seed {s.seed}" if s.seeds == 1 else f"seeds {s.seed}..{s.seed + s.seeds - 1}"
@@ -43,6 +45,8 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted) -> None:
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (queried)"
     terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+    if checked is not None:
+        describe_prior(terminal, checked)
 
 
 def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:

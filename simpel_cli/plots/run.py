@@ -27,6 +27,7 @@ MOST_POINTS = 200  # of a panel: more of them is a band of ink
 def draw_run(directory: Path) -> list[Path]:
     """Draw every figure whose Parquet file is there; returns their paths."""
     figures = [
+        (_prior_predictive, directory / "prior_predictive.parquet", "prior_predictive"),
         (_learning_curves, directory / "metrics.parquet", "learning_curves"),
         (_predictions, directory / "predictions.parquet", "predictions"),
         (_calibration, directory / "calibration.parquet", "calibration"),
@@ -40,6 +41,26 @@ def draw_run(directory: Path) -> list[Path]:
             if figure is not None:
                 drawn.append(save(figure, directory / f"{name}.png"))
     return drawn
+
+
+def _prior_predictive(path: Path) -> Any:
+    """Training targets among draws of the simulator, in the order of the draws' medians."""
+    table = columns_of(path)
+    outputs = distinct(table["output"])
+    figure, axes = new_figure(len(outputs))
+    for axis, output in zip(axes, outputs, strict=True):
+        own = table["output"] == output
+        order = np.argsort(table["median"][own], kind="stable")
+        shown = {name: column[own][order] for name, column in table.items()}
+        place = np.arange(len(order))
+        axis.fill_between(place, shown["lowest"], shown["highest"], color=COLOURS[0], alpha=0.15, label="all draws")
+        axis.fill_between(place, shown["low"], shown["high"], color=COLOURS[0], alpha=0.35, label="90 % of the draws")
+        out = shown["outside"]
+        axis.plot(place[~out], shown["measured"][~out], ".", color=BLACK, markersize=4, label="measured")
+        axis.plot(place[out], shown["measured"][out], "x", color=COLOURS[1], markersize=5, label="measured, outside")
+        axis.set(title=output, xlabel="training target", ylabel=with_unit("value", shown["unit"][0]))
+    legend_below(figure, axes[0])
+    return figure
 
 
 def _learning_curves(path: Path) -> Any:

@@ -1,0 +1,93 @@
+"""Whether a prior can explain the data: right for data of the prior itself, and for data that no parameters explain."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from simpel_cli.inference import NoiseModel
+from simpel_cli.prior import GapGP, SimulatorPrior
+from simpel_cli.prior_predictive import SURPRISING, PriorCheck, check_prior
+from simpel_cli.problem import System, assemble, normaliser_of, system_of
+from simpel_cli.run import stream
+from simpel_cli.scores.gaussian import Gaussian
+from simulators.model import Declared
+
+NOISE = 0.02
+
+
+@pytest.fixture(scope="module")
+def ramp() -> System:
+    """A curve whose height and bend are uncertain, and no normal law."""
+    declared = Declared(
+        "ramp", dt=1.0, inputs={"x": {"unit": "m", "range": [-1, 1]}},
+        parameters={"a": {"range": [0.5, 1.5], "unit": "1"}, "b": {"range": [0, 3], "unit": "1/m"}},
+        outputs={"f": {"unit": "m", "expression": "a*tanh(b*x)"}},
+    ).model()  # fmt: skip
+    return system_of(declared, ("f",), 0)
+
+
+def checked(system: System, y: np.ndarray, x: np.ndarray, gap: bool = True) -> PriorCheck:
+    normaliser = normaliser_of(system, stream(0, "normaliser"))
+    prior = SimulatorPrior(gap=GapGP() if gap else None)
+    assembled = assemble(
+        system, normaliser, prior, Gaussian(), [(x[:, None], y[:, None])], {"f": NOISE}, {"f": NOISE}, noise=NoiseModel(),
+        pool=64, keys=[stream(0, "prior")], precision="float64",
+    )  # fmt: skip
+    kappa = np.asarray(assembled.problems.gap_scale[0]) if gap else None
+    noise = np.array([NOISE]) / np.asarray(normaliser.y_std)
+    judge = partial(check_prior, system, assembled.setting, normaliser, x[:, None], y[:, None], noise)
+    return judge(kappa, stream(0, "prior_predictive"))
+
+
+def test_data_of_the_prior_itself_surprise_as_often_as_they_should(ramp: System) -> None:
+    random, x = np.random.default_rng(0), np.linspace(-0.9, 0.9, 15)
+    shares = []
+    for k in range(40):
+        y = ramp.simulate(jax.random.key(k), x[:, None], 1)[0, :, 0] + NOISE * random.normal(size=15)
+        (found,) = checked(ramp, y, x, gap=False).outputs
+        shares.append(found.p)
+        assert found.outside == 0
+        assert found.distance_with_gap is None
+    # uniform on 0..1: the mean of 40 has a standard deviation of 0.046
+    assert np.mean(shares) == pytest.approx(0.5, abs=0.15)
+    assert np.mean(np.array(shares) < 0.2) < 0.4
+    assert min(shares) > SURPRISING
+
+
+def test_values_beyond_every_draw_are_counted(ramp: System) -> None:
+    x = np.linspace(-0.9, 0.9, 12)
+    y = np.tanh(x)
+    y[3] = 2.5
+    check = checked(ramp, y, x, gap=False)
+    (found,) = check.outputs
+    assert (found.outside, found.rows) == (1, 12)
+    assert not found.by_simulator
+    assert not found.explained
+    assert found.distance > 3
+    assert [bool(o) for o in check.table["outside"]] == [i == 3 for i in range(12)]
+    assert check.table["measured"] == y.tolist()
+    low, high = np.array(check.table["lowest"]), np.array(check.table["highest"])
+    assert (low[:3] <= y[:3]).all()
+    assert (y[4:] <= high[4:]).all()
+    assert np.all(np.array(check.table["low"]) <= np.array(check.table["median"]))
+
+
+def test_a_shape_that_no_parameters_have_surprises_though_every_value_is_in_range(ramp: System) -> None:
+    x = np.linspace(-0.9, 0.9, 15)
+    y = np.tanh(x) + 0.1 * np.sin(12 * x)
+    (found,) = checked(ramp, y, x).outputs
+    assert not found.by_simulator
+    assert found.p < SURPRISING
+    (alone,) = checked(ramp, y, x, gap=False).outputs
+    assert not alone.explained
+
+
+def test_a_gap_explains_what_the_simulator_cannot(ramp: System) -> None:
+    x = np.linspace(-0.9, 0.9, 15)
+    (found,) = checked(ramp, np.tanh(x) + 0.3 * x**2, x).outputs
+    assert not found.by_simulator
+    assert found.explained
+    assert found.distance_with_gap is not None
+    assert found.distance_with_gap < 2
