@@ -23,18 +23,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
-from simpel_cli.nets import MLP, Particles
-from simpel_cli.predictive import Predictive
+from simpel_cli.methods.networks import Networks, State
+from simpel_cli.nets import MLP
 
 LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
-
-
-class State(NamedTuple):
-    """L networks, the noise parameter, and the optimiser's state of both."""
-
-    particles: Particles
-    noise: Float[Array, " dy"]
-    optimiser: optax.OptState
 
 
 class Draws(NamedTuple):
@@ -98,19 +90,11 @@ class FunctionSpace(ABC):
         """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
         to_normalised = problem.normaliser
         dtype = problem.x.dtype
-        n_rows, dim_x = problem.x.shape
-        dim_y = problem.y.shape[1]
+        n_rows = problem.x.shape[0]
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
         optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
 
-        def noise_std(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
-            return self.noise.std(rho, problem.noise_floor)
-
-        def init(key: PRNGKeyArray) -> State:
-            keys = jax.random.split(key, self.particles)
-            particles = jax.vmap(lambda k: self.network.init(k, dim_x, dim_y, dtype))(keys)
-            noise = self.noise.init(problem.noise_init, problem.noise_floor)
-            return State(particles, noise, optimiser.init((particles, noise)))
+        networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
         def draw(key: PRNGKeyArray) -> Draws:
             if problem.bank is not None:
@@ -144,23 +128,16 @@ class FunctionSpace(ABC):
 
             weight = problem.m.astype(dtype) / jnp.sum(counted)
             fit, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: log_likelihood(h, noise_std(rho), y, counted), argnums=(0, 1)
+                lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
             )(h[:, :b], state.noise)
             score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
             score = score.at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
 
             (ascent,) = pull_back(velocity)
-            # the noise is shared by the particles: its gradient is averaged over them
-            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init, problem.noise_floor)
-            ascent_noise = weight * score_noise / self.particles + noise_prior if self.noise.learn else 0 * state.noise
-            descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
-            with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
-                updates, opt_state = optimiser.update(descent, state.optimiser, (state.particles, state.noise))
-            particles = optax.apply_updates(state.particles, updates[0])
-            noise = state.noise + self.noise.rate * updates[1]
-            info = Info(-fit / (jnp.sum(counted) * self.particles), noise_std(state.noise), mean_kernel)
-            return State(particles, noise, opt_state), info
+            after = networks.ascended(state, ascent, weight * score_noise)
+            info = Info(-fit / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            return after, info
 
         def prior_score(
             key: PRNGKeyArray, h: Float[Array, "L k dy"], samples: Float[Array, "k dy N"], x: Float[Array, "k dx"]
@@ -179,14 +156,7 @@ class FunctionSpace(ABC):
             every = jax.vmap(estimate, in_axes=(2, 1, 0, None if gap is None else 1), out_axes=2)
             return every(h, samples, covariance, gap)
 
-        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
-            h = self.network.apply_all(state.particles, to_normalised.x(x))
-            return Predictive(to_normalised.y_to_data(h), noise_std(state.noise) * to_normalised.y_std)
-
-        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
-            return to_normalised.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(to_normalised.x)(x)))
-
-        return Inference(init, draw, step, predict, members)
+        return Inference(networks.init, draw, step, networks.predict, networks.members)
 
 
 def distinct_rows(key: PRNGKeyArray, size: int, m: Int[Array, ""]) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:

@@ -4,7 +4,6 @@ Reference: Liu and Wang (2016), Stein variational gradient descent, algorithm 1.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +14,8 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.fsvgd import refuse_bandwidth, stein_velocity
 from simpel_cli.methods.function_space import distinct_rows, log_likelihood
+from simpel_cli.methods.networks import Networks, State
 from simpel_cli.nets import MLP, Particles
-from simpel_cli.predictive import Predictive
-
-
-class State(NamedTuple):
-    """L networks, the noise parameter, and the optimiser's state of both."""
-
-    particles: Particles
-    noise: Float[Array, " dy"]
-    optimiser: optax.OptState
 
 
 @dataclass(frozen=True)
@@ -73,19 +64,11 @@ class SVGD:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
         to_normalised = problem.normaliser
         dtype = problem.x.dtype
-        n_rows, dim_x = problem.x.shape
-        dim_y = problem.y.shape[1]
+        n_rows = problem.x.shape[0]
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
         optimiser = optax.adam(rate)
 
-        def noise_std(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
-            return self.noise.std(rho, problem.noise_floor)
-
-        def init(key: PRNGKeyArray) -> State:
-            keys = jax.random.split(key, self.particles)
-            particles = jax.vmap(lambda k: self.network.init(k, dim_x, dim_y, dtype))(keys)
-            noise = self.noise.init(problem.noise_init, problem.noise_floor)
-            return State(particles, noise, optimiser.init((particles, noise)))
+        networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
             batch, is_data = distinct_rows(key, min(self.batch, n_rows), jnp.asarray(problem.m))
@@ -94,31 +77,18 @@ class SVGD:
             weight = problem.m.astype(dtype) / jnp.sum(counted)
 
             def fit(particles: Particles, rho: Float[Array, " dy"]) -> Float[Array, ""]:
-                return log_likelihood(self.network.apply_all(particles, x), noise_std(rho), y, counted)
+                return log_likelihood(self.network.apply_all(particles, x), networks.noise_std(rho), y, counted)
 
             value, (slope, slope_noise) = jax.value_and_grad(fit, argnums=(0, 1))(state.particles, state.noise)
             prior = jax.grad(lambda p: self.log_prior(p))(state.particles)
             score = jax.tree.map(lambda a, b: weight * a + self.prior_weight * b, slope, prior)
             flat, unflatten = _flattened(state.particles)
             velocity, mean_kernel = stein_velocity(flat, _flattened(score)[0], self.bandwidth)
-            # the noise is shared by the particles: its gradient is averaged over them
-            noise_prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init, problem.noise_floor)
-            ascent_noise = weight * slope_noise / self.particles + noise_prior if self.noise.learn else 0 * state.noise
-            descent = jax.tree.map(jnp.negative, (unflatten(velocity), ascent_noise))
-            with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
-                updates, opt_state = optimiser.update(descent, state.optimiser)
-            particles = optax.apply_updates(state.particles, updates[0])
-            info = Info(-value / (jnp.sum(counted) * self.particles), noise_std(state.noise), mean_kernel)
-            return State(particles, state.noise + self.noise.rate * updates[1], opt_state), info
+            after = networks.ascended(state, unflatten(velocity), weight * slope_noise)
+            info = Info(-value / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            return after, info
 
-        def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
-            h = self.network.apply_all(state.particles, to_normalised.x(x))
-            return Predictive(to_normalised.y_to_data(h), noise_std(state.noise) * to_normalised.y_std)
-
-        def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
-            return to_normalised.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(to_normalised.x)(x)))
-
-        return Inference(init, lambda key: None, step, predict, members)
+        return Inference(networks.init, lambda key: None, step, networks.predict, networks.members)
 
     def log_prior(self, particles: Particles) -> Float[Array, ""]:
         """Return the sum over particles of the log density of their weights, up to a constant."""

@@ -1,0 +1,79 @@
+"""Networks that share a noise: how they begin, predict and take a step, whatever says where they should go."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli.inference import NoiseModel, Problem
+from simpel_cli.nets import MLP, Particles
+from simpel_cli.predictive import Predictive
+
+
+class State(NamedTuple):
+    """L networks, the noise parameter, and the optimiser's state of both."""
+
+    particles: Particles
+    noise: Float[Array, " dy"]
+    optimiser: optax.OptState
+
+
+class Networks(NamedTuple):
+    """L networks on one problem.
+
+    Args:
+        number: of networks, L.
+        network: architecture.
+        noise: observation noise, shared by the networks.
+        optimiser: of networks and noise.
+        problem: what they learn.
+    """
+
+    number: int
+    network: MLP
+    noise: NoiseModel
+    optimiser: optax.GradientTransformation
+    problem: Problem
+
+    def init(self, key: PRNGKeyArray) -> State:
+        """Return independent networks and the noise's initial value."""
+        problem = self.problem
+        dims, dtype = (problem.x.shape[1], problem.y.shape[1]), jnp.asarray(problem.x).dtype
+        particles = jax.vmap(lambda k: self.network.init(k, *dims, dtype))(jax.random.split(key, self.number))
+        noise = self.noise.init(problem.noise_init, problem.noise_floor)
+        return State(particles, noise, self.optimiser.init((particles, noise)))
+
+    def noise_std(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+        """Return sigma, normalised."""
+        return self.noise.std(rho, self.problem.noise_floor)
+
+    def ascended(self, state: State, ascent: Particles, slope_noise: Float[Array, " dy"]) -> State:
+        """Take a step.
+
+        Args:
+            state: before it.
+            ascent: where the networks should go.
+            slope_noise: slope of the log likelihood of all training rows in the noise parameter, summed over networks.
+        """
+        problem = self.problem
+        # the noise is shared by the particles: its gradient is averaged over them
+        prior = jax.grad(self.noise.log_prior)(state.noise, problem.noise_init, problem.noise_floor)
+        ascent_noise = slope_noise / self.number + prior if self.noise.learn else 0 * state.noise
+        descent = jax.tree.map(jnp.negative, (ascent, ascent_noise))
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
+            updates, optimiser = self.optimiser.update(descent, state.optimiser, (state.particles, state.noise))
+        particles = optax.apply_updates(state.particles, updates[0])
+        return State(particles, state.noise + self.noise.rate * updates[1], optimiser)
+
+    def predict(self, state: State, x: Float[Array, "n dx"]) -> Predictive:
+        """Return the predictive at inputs in data units."""
+        scale = self.problem.normaliser
+        h = self.network.apply_all(state.particles, scale.x(x))
+        return Predictive(scale.y_to_data(h), self.noise_std(state.noise) * scale.y_std)
+
+    def members(self, state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
+        """Return the targets of every network at its own inputs, data units."""
+        scale = self.problem.normaliser
+        return scale.y_to_data(jax.vmap(self.network.apply)(state.particles, jax.vmap(scale.x)(x)))
