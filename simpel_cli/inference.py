@@ -70,6 +70,11 @@ class PriorProcess(Protocol):
         """Number of simulator draws, N."""
         ...
 
+    @property
+    def simulates(self) -> bool:
+        """Whether there is a simulator part; without one the prior is centred on the mean of the normaliser."""
+        ...
+
     def simulate(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
         """Draw the simulator part at inputs in data units; data units out."""
         ...

@@ -72,6 +72,11 @@ class FunctionPrior(NamedTuple):
     step: OneStep | None
     dim_y: int
 
+    @property
+    def simulates(self) -> bool:
+        """Whether a simulator is in it that can be run."""
+        return self.step is not None
+
     def simulate(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
         """Draw n parameter vectors and run the simulator of each at every input (data units)."""
         if self.step is None:

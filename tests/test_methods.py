@@ -10,6 +10,7 @@ import optax
 import oracles
 import pytest
 
+from simpel_cli import loop
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.methods.exact_gp import ExactGP
@@ -242,6 +243,62 @@ def test_svgd_moves_weights_along_steins_velocity_of_the_log_posterior() -> None
     )  # Adam's first step is its sign
     assert float(info.loss) > 0
     assert flat.shape == (10,)
+
+
+def test_a_prior_without_a_simulator_is_centred_on_the_mean_of_the_normaliser() -> None:
+    problem = problem_of(X)
+    problem = problem._replace(normaliser=problem.normaliser._replace(y_mean=jnp.full(1, 5.0), y_std=jnp.full(1, 2.0)))
+    method = FSVGD(particles=2, network=MLP((4,)), pool=16, fresh_points=8)
+    without = GPPrior().bind(None, 1, 1, np.ones(1))
+    draws = method.bind(setting_of(without), problem).draw(jax.random.key(0))
+    np.testing.assert_array_equal(draws.samples, 0.0)
+    with_one = method.bind(setting_of(prior_of()), problem).draw(jax.random.key(0))
+    np.testing.assert_allclose(np.mean(with_one.samples), -2.5, atol=0.3)  # a line through 0 is 5/2 below the mean
+
+
+SMALL: dict[str, Any] = {"network": MLP((8,)), "particles": 3, "batch": 4}
+FEW: dict[str, Any] = SMALL | {"fresh_points": 4, "pool": 8}
+EVERY = {
+    "fsvgd": FSVGD(steps=6, **FEW), "map": FunctionMAP(steps=6, **FEW), "repulsive": Repulsive(steps=6, **FEW),
+    "svgd": SVGD(steps=6, **SMALL), "sysid": SysID(steps=6, starts=2, particles=3),
+    "gp": ExactGP(sysid=SysID(steps=6, starts=2), particles=3),
+    "greybox": GreyBox(SysID(steps=6, starts=2), FSVGD(steps=6, **FEW)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(EVERY))
+def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_zero(name: str) -> None:
+    method, seeds = EVERY[name], 2
+
+    def two(x: jax.Array, phi: jax.Array) -> jax.Array:
+        return jnp.concatenate([phi[:1] * x + 20.0, phi[1:] * x - 300.0])
+
+    prior = FunctionPrior(16, 1e-4, GPPrior().kernel, np.ones(1), PARAMS, two, 2)
+    x = np.repeat(X[None], seeds, axis=0)
+    y = np.concatenate([1.3 * X, 0.5 * X], axis=1)[None] + np.zeros((seeds, 1, 1))
+    pad = padded_length(N)
+    problem = Problem(
+        x=np.stack([pad_rows(a, pad) for a in x]), y=np.stack([pad_rows(a, pad) for a in y]), m=np.full(seeds, N, np.int32),
+        normaliser=Normaliser(*(np.tile(v, (seeds, 1)) for v in ([0.0], [1.0], [20.0, -300.0], [1.0, 1.0]))),
+        gap_scale=np.full((seeds, 2), 0.3), noise_init=np.full((seeds, 2), NOISE), noise_floor=np.full((seeds, 2), 1e-3),
+    )  # fmt: skip
+    problem = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32 if a.dtype == float else None), problem)
+    setting = setting_of(prior)._replace(
+        sample_inputs=lambda key, n: jax.random.uniform(key, (n, 1), jnp.float32, -2.0, 2.0)
+    )
+    keys = jax.random.split(jax.random.key(0), seeds)
+    program = loop.compiled(lambda p: method.bind(setting, p), problem, keys, 2)
+    whole = [jax.tree.map(np.array, s.state) for s in loop.train(program, 6)]
+    # a stretch gives its state's memory to the next one: what is gone on with is a copy
+    rest = [s.state for s in loop.train(program, 6, state=jax.tree.map(jnp.asarray, whole[0]), start=2)]
+    jax.tree.map(np.testing.assert_array_equal, whole[-1], jax.tree.map(np.array, rest[-1]))
+    one = jax.tree.map(lambda a: jnp.asarray(a[0]), (problem, whole[-1]))
+    found = method.bind(setting, one[0]).predict(one[1], jnp.asarray(X, jnp.float32))
+    assert found.particles.shape == (method.particles, N, 2)
+    assert np.isfinite(np.asarray(found.particles)).all()
+    assert abs(float(found.mean[:, 0].mean()) - 20.0) < 5
+    assert abs(float(found.mean[:, 1].mean()) + 300.0) < 5
+    assert found.particles.dtype == jnp.float32
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ class ExactGP:
 
         def quantiles() -> Float[Array, "L dy"]:
             """Standard normal quantiles of unit variance, in another order for every output, so that they are independent."""
-            q = jax.scipy.stats.norm.ppf((jnp.arange(self.particles, dtype=dtype) + 0.5) / self.particles)
+            q = jax.scipy.special.ndtri((jnp.arange(self.particles, dtype=dtype) + 0.5) / self.particles)
             q = q / jnp.sqrt(jnp.mean(q**2))
             keys = jax.random.split(jax.random.key(0), problem.y.shape[1])
             return jnp.stack([jax.random.permutation(key, q) for key in keys], axis=1)

@@ -104,6 +104,8 @@ class FunctionSpace(ABC):
                 fresh = setting.sample_inputs(key_x, self.pool)
                 x = jnp.concatenate([jnp.asarray(problem.x), fresh])
                 samples = jnp.moveaxis(setting.prior.simulate(key_phi, x, setting.prior.draws), 0, -1)
+                if not setting.prior.simulates:
+                    return Draws(to_normalised.x(x), samples)
             scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
             return Draws(to_normalised.x(x), scaled)
 

@@ -121,7 +121,7 @@ class SysID:
 
         def init(key: PRNGKeyArray) -> State:
             random = jax.random.uniform(key, (self.starts, dim_u), dtype, 0.05, 0.95)
-            u = jnp.where(gaussian[None], jax.scipy.stats.norm.ppf(random), random).astype(dtype)
+            u = jnp.where(gaussian[None], jax.scipy.special.ndtri(random), random)
             u = u.at[0].set(jnp.where(gaussian, 0.0, 0.5))  # one from the middle
             rho = jnp.tile(self.noise.init(problem.noise_init, problem.noise_floor)[None], (self.starts, 1)).astype(
                 dtype
