@@ -1,6 +1,5 @@
 """Estimators that see more than two moments, against exact scores and against plain linear algebra."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,38 +14,10 @@ from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod, field
 from simpel_cli.scores.ssge import SSGE
+from tests.score_targets import covariance_of, target
 
-Target = tuple[Callable[[int], np.ndarray], Callable[[np.ndarray], np.ndarray]]
 NUMBER_OF_POINTS = 50
 ESTIMATORS: dict[str, Any] = {"gaussian": Gaussian(), "kde": KDE(), "ssge": SSGE(), "nu_method": NuMethod()}
-
-
-def covariance_of(m: int) -> np.ndarray:
-    """Smooth functions plus noise at m points."""
-    t = np.linspace(0, 1, m)
-    return 0.9 * oracles.squared_exponential(t, t, 0.3) + 0.1 * np.eye(m)
-
-
-def target(name: str, m: int, seed: int = 0) -> Target:
-    """Draws and exact score of a correlated Gaussian, of two of them apart, and of a skewed law."""
-    random = np.random.default_rng(seed)
-    covariance = covariance_of(m)
-    root, apart = np.linalg.cholesky(covariance), 2 * np.ones(m)
-
-    def smooth(n: int) -> np.ndarray:
-        return random.normal(size=(n, m)) @ root.T
-
-    if name == "gaussian":
-        return smooth, lambda h: oracles.gaussian_score(h, np.zeros(m), covariance)
-    if name == "mixture":
-        return (
-            lambda n: smooth(n) + random.choice([-1.0, 1.0], (n, 1)) * apart,
-            lambda h: oracles.mixture_score(h, np.stack([apart, -apart]), covariance),
-        )
-    return (
-        lambda n: np.exp(0.5 * random.normal(size=(n, m))) @ root.T,
-        lambda h: oracles.lognormal_score(h, root, 0.5),
-    )
 
 
 def error(estimator: Any, name: str, m: int, n: int, seed: int = 0) -> float:
