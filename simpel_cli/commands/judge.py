@@ -22,6 +22,7 @@ class Judged(NamedTuple):
     blocks: str
     horizon: float | None  # s, of the free runs; None: no episode is long enough
     noise_std: np.ndarray  # learned, per seed and target, (seeds, dy), data units
+    distinct: list[float]  # effective number of different particles, per seed
 
 
 def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, directory: Path, step: int) -> Judged:
@@ -53,10 +54,12 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
         "trajectories": [],
     }
     rows: list[dict[str, Any]] = []
+    distinct = [ev.distinct_particles(posterior, x) for posterior in posteriors]
     run = None
-    for seed, posterior in zip(study.settings.all_seeds, posteriors, strict=True):
+    for seed, posterior, number in zip(study.settings.all_seeds, posteriors, distinct, strict=True):
         result = ev.one_step(posterior, x, y)
         found = ev.one_step_table(result, blocks, encoding, target_std)
+        found.append({"metric": "distinct_particles", "output": "joint", "unit": "1", "value": number})
         tables["predictions"].append(_predictions(seed, where, y, result, encoding))
         tables["calibration"].append(_calibration(seed, result, encoding))
         run = ev.free_run(posterior, encoding, follow, horizon) if horizon else None
@@ -70,7 +73,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
         if parts:
             write_table(directory / f"{name}.parquet", {k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     noise_std = np.stack([ev.noise_of(posterior, encoding) for posterior in posteriors])
-    return Judged(rows, str(blocks), horizon * dt if run is not None else None, noise_std)
+    return Judged(rows, str(blocks), horizon * dt if run is not None else None, noise_std, distinct)
 
 
 def _places(study: Study, episodes: Sequence[Episode], index: np.ndarray, row: np.ndarray) -> Places:

@@ -28,6 +28,7 @@ def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) 
         ("training", f"{used} of {fitted.available} {'transitions' if study.system.source.states else 'rows'}"),
         ("seeds", ", ".join(map(str, seeds))),
         ("gap scale kappa", _kappa(study, fitted)),
+        ("distinct particles", _distinct(study, judged.distinct)),
         ("learned noise", _per_output(study, judged.noise_std)),
         ("device", f"{manifest.facts.get('device', study.device)}, {study.settings.precision}"),
         ("time", _time(manifest)),
@@ -51,6 +52,11 @@ def _kappa(study: Study, fitted: Fitted) -> str:
         return "no gap GP"
     scale = np.asarray(fitted.assembled.problems.gap_scale, dtype=float)
     return _per_output(study, scale * fitted.target_std)
+
+
+def _distinct(study: Study, numbers: list[float]) -> str:
+    low, high = f"{min(numbers):.3g}", f"{max(numbers):.3g}"
+    return f"{low if low == high else f'{low}..{high}'} of {study.method.particles}; closer than the noise counts as the same"
 
 
 def _per_output(study: Study, values: np.ndarray) -> str:

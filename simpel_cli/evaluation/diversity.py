@@ -1,0 +1,30 @@
+"""How many different functions a posterior holds: L particles that move in step are one.
+
+    N = exp(-sum_k lambda_k log lambda_k),    lambda: eigenvalues of K/L,    K_ij = exp(-|h_i - h_j|^2 / (2 n dy sigma^2))
+
+with function values at n test inputs, each output in units of the learned noise: what lies closer than that is the same
+function to the data. N is 1 where all particles agree and L where all are apart.
+
+Reference: Friedman and Dieng (2023), The Vendi score: a diversity evaluation metric for machine learning, eq. 2.
+"""
+
+import numpy as np
+
+from simpel_cli.evaluation.posterior import CHUNK, Posterior
+
+
+def distinct_particles(posterior: Posterior, x: np.ndarray) -> float:
+    """Return the effective number of distinct particles at inputs x (n, dx), of which CHUNK at most are looked at."""
+    rows = np.linspace(0, len(x) - 1, CHUNK).round().astype(int)  # of one size: one compiled program
+    found = posterior.predict(x[rows])
+    particles, scale = (np.asarray(a, float) for a in (found.particles, found.noise_std))
+    return effective_number(particles / scale)
+
+
+def effective_number(h: np.ndarray) -> float:
+    """Return the effective number of distinct members; h: (L, n, dy), a distance of 1 in every value is one of 1."""
+    flat = h.reshape(len(h), -1)
+    squared = np.mean((flat[:, None] - flat[None]) ** 2, axis=-1)
+    values = np.linalg.eigvalsh(np.exp(-squared / 2) / len(h))
+    values = values[values > 0]
+    return float(np.exp(-np.sum(values * np.log(values))))
