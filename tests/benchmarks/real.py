@@ -4,11 +4,10 @@ Every verdict as a row of a table, and the errors after each accepted effect.
 """
 
 import argparse
-import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
+
+from tests.benchmarks.cost import searched
 
 EXPERIMENTS = ("free_pendulum", "cascaded_tanks", "ball_drops", "emps", "rc_car_bicycle", "rc_car")
 CLOSED = ("free_pendulum", "emps", "rc_car_bicycle")  # SimPEL with the old and the corrected simulator, too
@@ -17,17 +16,8 @@ WORDS = {"rc_car_bicycle": ("effect=[vehicle]",)}
 
 def run(name: str, out: Path) -> dict[str, Any]:
     """Search one recording, unless that was done, and return its verdict."""
-    directory = out / name
-    if not (directory / "verdict.json").exists():
-        words = [
-            "discover",
-            f"experiment={name}",
-            f"close={str(name in CLOSED).lower()}",
-            f"hydra.run.dir='{directory}'",
-            *WORDS.get(name, ()),
-        ]
-        subprocess.run([sys.executable, "-m", "simpel_cli.main", *words], check=True)
-    return json.loads((directory / "verdict.json").read_text())
+    words = [f"experiment={name}", f"close={str(name in CLOSED).lower()}", *WORDS.get(name, ())]
+    return searched(words, out / name)
 
 
 def row(name: str, found: dict[str, Any]) -> str:
@@ -39,7 +29,11 @@ def row(name: str, found: dict[str, Any]) -> str:
         cells.append("<br>".join(pairs))
     effects = ", ".join(f"{e['name']} on {e['acts_on']}" for e in found["effects"]) or "-"
     rest = f"; left: depends on {', '.join(found['remainder']['depends_on'])}" if found["remainder"] else ""
-    return f"| {name} | {found['verdict']} | {effects}{rest} | " + " | ".join(cells) + f" | {found['seconds']:.0f} |"
+    return (
+        f"| {name} | {found['verdict']} | {effects}{rest} | "
+        + " | ".join(cells)
+        + f" | {found['seconds']:.0f} | {found['cost']['memory_mib']:.0f} |"
+    )
 
 
 def steps(name: str, found: dict[str, Any]) -> list[str]:
@@ -64,8 +58,8 @@ def main() -> None:
     options = parser.parse_args()
     out = options.out.resolve()
     lines = [
-        "| recording | verdict | effects | one step | 20 rows ahead | free run | seconds |",
-        "|---|---|---|---|---|---|---|",
+        "| recording | verdict | effects | one step | 20 rows ahead | free run | seconds | MiB |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     sentences = []
     for name in options.only:
