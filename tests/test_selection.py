@@ -18,8 +18,9 @@ from simpel_cli.discovery.fit import Fitter, Lane, Optimum
 from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.screen import Score, promises
 from simpel_cli.discovery.search import ACCEPT, QUIETER, SAME, TIE, Trial, asked
-from simpel_cli.discovery.selection import select
+from simpel_cli.discovery.selection import cut, further, select
 from simulators.effects import Expression
+from tests.test_swings import pushed
 from tests.test_twins import searched
 
 
@@ -287,3 +288,47 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     search, _, left, _ = _calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
     np.testing.assert_array_equal(left.ok, none_left)
     np.testing.assert_array_equal(search.plan.spare.ok, none_left)  # what is held out to judge effects
+
+
+def test_a_search_goes_on_from_what_is_left_of_it() -> None:
+    search = pushed(lambda _, __, v: -0.4 * v, 0.0, 1).search
+    found = select(search)
+    assert [search.terms[t].effect for t in found.chosen.terms] == ["friction"]
+    left = cut(search, found, ())
+    again = further(search, left)
+    assert again.chosen.terms == found.chosen.terms
+    assert len(again.stages) > len(left.stages)
+    search.banned.update(found.chosen.terms)
+    none = further(search, left)
+    assert none.chosen.terms == ()
+    assert none.remainder is not None
+    assert none.remainder[0].depends_on == ("v",)
+    assert none.stages[-1].before.terms == ()
+    assert not {t.terms[-1] for t in none.stages[-1].trials} & search.banned
+
+
+def test_a_base_that_had_not_found_its_place_is_left_for_a_better_one() -> None:
+    """What an effect seems to add may be a better fit of the simulator alone, which the effect led to."""
+    search = pushed(lambda _, __, v: -0.4 * v, 0.0, 1).search
+    good = search.base()
+    z = good.optimum.z.copy()
+    z[0] = 0.02  # far from where the gain of the input belongs
+    lost = good.optimum._replace(z=z, log_evidence=good.optimum.log_evidence - 300, loss=good.optimum.loss + 300)
+    search.known.clear()
+    search.known[frozenset()] = lost
+    found = select(search, Trial((), lost))
+    assert [search.terms[t].effect for t in found.chosen.terms] == ["friction"]
+    assert found.base.optimum.log_evidence > good.optimum.log_evidence - 1
+    earned = found.chosen.optimum.log_evidence - found.base.optimum.log_evidence
+    assert found.gains == pytest.approx((earned,), abs=0.5)
+
+    still = pushed(lambda _, __, ___: 0.0, 0.0, 2).search
+    good = still.base()
+    z = np.where(np.arange(len(z)) == 0, 0.02, good.optimum.z)
+    lost = good.optimum._replace(z=z, log_evidence=good.optimum.log_evidence - 300)
+    still.known.clear()
+    still.known[frozenset()] = lost
+    none = select(still, Trial((), lost))
+    assert none.chosen.terms == ()
+    assert none.chosen.optimum.log_evidence > good.optimum.log_evidence - 1
+    assert none.stages[0].before.optimum.log_evidence == none.chosen.optimum.log_evidence

@@ -14,7 +14,7 @@ from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.levels import Levels, evidence
 from simpel_cli.discovery.remainder import remainder_of
 from simpel_cli.discovery.search import Search
-from simpel_cli.discovery.selection import cut, further, select
+from simpel_cli.discovery.selection import select
 from simpel_cli.discovery.setup import setup
 from simpel_cli.discovery.swings import swing
 from simulators.model import Declared
@@ -83,20 +83,3 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
 @pytest.mark.parametrize(("friction", "shaken"), [(0.0, 0.0), (0.0, 0.3), (0.4, 0.0)])
 def test_noise_and_a_named_friction_are_no_swings(friction: float, shaken: float) -> None:
     assert swing(pushed(lambda _, __, v: -friction * v, shaken, 1)) is None
-
-
-def test_a_search_goes_on_from_what_is_left_of_it() -> None:
-    search = pushed(lambda _, __, v: -0.4 * v, 0.0, 1).search
-    found = select(search)
-    assert [search.terms[t].effect for t in found.chosen.terms] == ["friction"]
-    left = cut(search, found, ())
-    again = further(search, left)
-    assert again.chosen.terms == found.chosen.terms
-    assert len(again.stages) > len(left.stages)
-    search.banned.update(found.chosen.terms)
-    none = further(search, left)
-    assert none.chosen.terms == ()
-    assert none.remainder is not None
-    assert none.remainder[0].depends_on == ("v",)
-    assert none.stages[-1].before.terms == ()
-    assert not {t.terms[-1] for t in none.stages[-1].trials} & search.banned

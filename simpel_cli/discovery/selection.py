@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.screen import promises
-from simpel_cli.discovery.search import ACCEPT, TIE, Search, Stage, Trial, asked
+from simpel_cli.discovery.search import ACCEPT, ASTRAY, TIE, Search, Stage, Trial, asked
 from simulators.effects import Term
 
 MOST_EFFECTS = 8
@@ -79,20 +79,37 @@ def further(search: Search, found: Selection) -> Selection:
 
 def _settled(search: Search, grown: _Grown) -> Selection:
     """Drop what is not needed in the end, put one term in the place of two where one will do, and name the rivals."""
-    stages = grown.stages
     for merger in range(MOST_MERGERS + 1):
-        chosen, gains, without = search.prune(grown.path[-1])
+        grown, chosen, gains, without = _pruned(search, grown)
         stage = _merged(search, chosen)
         if stage is None or _nameless(search, stage.trials[0]) or merger == MOST_MERGERS:
             break
         whole = stage.trials[0]
         search.told(f"{search.terms[whole.terms[-1]].label} in place of two")
-        grown = _grow(search, _path(search, whole))
-        stages += (stage, *grown.stages)
+        again = _grow(search, _path(search, whole))
+        grown = again._replace(stages=(*grown.stages, stage, *again.stages))
     path = _path(search, chosen)
-    found = Selection(path[0], chosen, path, (), stages, gains, grown.remainder)
+    found = Selection(path[0], chosen, path, (), grown.stages, gains, grown.remainder)
     instead = stage.trials[0] if stage is not None and _nameless(search, stage.trials[0]) else None
     return _against(search, found, without, instead)
+
+
+def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, ...], list[Trial]]:
+    """Drop what is not needed in the end; return it with what each effect adds, and the rest without it.
+
+    What an effect seemed to add may be a better fit of the smaller model, which the effect led to: then the search grew from
+    the wrong place, and grows once more.
+    """
+    while True:
+        chosen, gains, without = search.prune(grown.path[-1])
+        first = next((t for t in grown.path[:-1] if set(t.terms) == set(chosen.terms)), None)
+        if first is None or not chosen.optimum.log_evidence > first.optimum.log_evidence + ASTRAY:
+            return grown, chosen, gains, without
+        search.told(
+            f"without what was added it fits {chosen.optimum.log_evidence - first.optimum.log_evidence:.0f} nats better"
+        )
+        again = _grow(search, _path(search, chosen))
+        grown = again._replace(stages=(*(grown.stages if chosen.terms else ()), *again.stages))
 
 
 def _worth(trial: Trial) -> float:

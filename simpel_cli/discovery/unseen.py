@@ -20,6 +20,7 @@ from simpel_cli.discovery.search import Search, Trial
 
 FAULTS = ("kinematics", "stale")  # checks of the data that can hide or feign an effect
 SHOWN = 6  # names in a sentence
+SURPRISING = 1.5  # times the standard deviation that the model claims, on episodes that it did not see
 
 
 def unseen(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[dict[str, str]]:
@@ -55,13 +56,20 @@ def in_words(entries: Sequence[dict[str, str]]) -> list[str]:
 
 
 def caveats(found: dict[str, Any]) -> str:
-    """Return what a verdict that found nothing must add: what it could not test, and what is wrong with the data."""
-    if found["verdict"] not in ("none", "unexplained"):
-        return ""
-    names = in_words(found["not_tested"])
-    text = f" Not tested by these data: {', '.join(names)}." if names else ""
-    faults = [c["check"] for c in found["data_checks"] if not c["ok"] and c["check"] in FAULTS]
-    return text + (f" The data have faults that come first: {', '.join(faults)}." if faults else "")
+    """Return what a verdict must add: what was not tested, what is wrong with the data, whether the test surprised it."""
+    text = ""
+    if found["verdict"] in ("none", "unexplained"):
+        names = in_words(found["not_tested"])
+        text += f" Not tested by these data: {', '.join(names)}." if names else ""
+        faults = [c["check"] for c in found["data_checks"] if not c["ok"] and c["check"] in FAULTS]
+        text += f" The data have faults that come first: {', '.join(faults)}." if faults else ""
+    name, most = max(found["error"]["surprise"].items(), key=lambda entry: np.nan_to_num(entry[1]))
+    if most > SURPRISING:
+        text += (
+            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times what the model expects: they go "
+            "where the training episodes did not."
+        )
+    return text
 
 
 def _information(fisher: np.ndarray, k: int) -> float:

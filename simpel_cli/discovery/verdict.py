@@ -71,6 +71,9 @@ def verdict_of(
             "after": results(after, measured, rows),
             "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
             "horizon_steps": horizon,
+            "surprise": dict(
+                zip(measured, (float(v) for v in rmse(after.one_step / np.sqrt(after.variance))), strict=True)
+            ),
         },
         "noise_floor": dict(zip(measured, noise_of(search, chosen)[0], strict=True)),
         "process_noise": {
