@@ -7,6 +7,7 @@ PYTHON ?= python3
 STAMP := $(VENV)/.installed
 RIVALS := $(VENV)/.rivals
 WORKERS ?= 2
+WORDS ?= experiment=pendulum
 SETS ?= 600
 SEED ?= 1
 OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
@@ -14,7 +15,7 @@ OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover exam lock data real clean reproduce-metrics_vs_n_train \
+.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train \
 	reproduce-sinusoids reproduce-bimodal
 
 help: ## Show this list
@@ -49,6 +50,9 @@ format: install ## Format the code
 
 bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
+
+sbc: install ## Calibrate the inference of an experiment on functions of its own prior (WORDS="experiment=pendulum method=fsvgd")
+	$(BIN)/python -m tests.benchmarks.sbc $(WORDS)
 
 bench-discover: install ## Measure time and memory of verdicts, compiled anew and cached (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.verdicts
