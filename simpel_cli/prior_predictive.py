@@ -11,18 +11,20 @@ Reference: Box (1980), Sampling and Bayes' inference in scientific modelling and
 Posterior predictive assessment of model fitness.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
+from scipy.special import ndtri
 
 from simpel_cli.inference import Bank, Normaliser, Setting
 from simpel_cli.problem import System
 
 DRAWS = 2048  # half of them for the moments, half to compare with
 MOST_ROWS = 128
-WIDER = 3.0  # standard deviations of the noise by which the range of the draws is widened
+NOISE_DRAWS = 64  # of which the mean response to an error of a state is taken
 SURPRISING = 5e-3  # share of the prior's own data as far off, below which it is said not to explain those measured
 BAND = (0.05, 0.95)
 JITTER = 1e-9  # of a covariance
@@ -33,7 +35,7 @@ class OutputCheck(NamedTuple):
 
     Args:
         name, unit: of the target.
-        outside: rows that lie outside every draw of the simulator, widened by the noise.
+        outside: rows that lie outside every draw of the simulator by more than noise can.
         rows: that were looked at.
         distance: d of the simulator alone, over the median of its own draws; about 1 where it explains the data.
         p: share of its own draws that are as far off.
@@ -52,7 +54,7 @@ class OutputCheck(NamedTuple):
     @property
     def explained(self) -> bool:
         """Whether the prior as a whole is compatible with the data."""
-        return (self.p if self.p_with_gap is None else self.p_with_gap) >= SURPRISING
+        return self.by_simulator if self.p_with_gap is None else self.p_with_gap >= SURPRISING
 
     @property
     def by_simulator(self) -> bool:
@@ -73,12 +75,14 @@ def check_prior(
     normaliser: Normaliser,
     x: np.ndarray,
     y: np.ndarray,
-    noise: np.ndarray,
+    noise_std: Mapping[str, float],
     gap_scale: np.ndarray | None,
     key: PRNGKeyArray,
     bank: Bank | None = None,
-) -> PriorCheck:
-    """Compare the training targets with draws of the prior.
+) -> PriorCheck | None:
+    """Compare the training targets with draws of the prior; None: there are too few draws to tell.
+
+    A gap whose scale was chosen on the same targets explains them more often than a prior would.
 
     Args:
         system: simulator and coordinates.
@@ -86,7 +90,7 @@ def check_prior(
         normaliser: of the system.
         x: (m, dx) training inputs, data units.
         y: (m, dy) targets, data units.
-        noise: (dy,) standard deviation of the targets' noise, normalised.
+        noise_std: of the measurements, per state and output, in its unit.
         gap_scale: (dy,) kappa, normalised; None: no gap.
         key: of the draws.
         bank: draws at the training inputs, where the simulator can only be queried.
@@ -94,40 +98,64 @@ def check_prior(
     rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), MOST_ROWS)).round().astype(int))
     x, y = x[rows], y[rows]
     y_mean, y_std = np.asarray(normaliser.y_mean, float), np.asarray(normaliser.y_std, float)
-    if bank is None:
-        drawn = system.simulate(key, x, DRAWS)
-    else:
-        drawn = np.moveaxis(np.asarray(bank.samples, float)[rows], -1, 0)
-    samples = (drawn - y_mean) / y_std  # (N, m, dy)
-    targets = (y - y_mean) / y_std
-    at = jnp.asarray((x - normaliser.x_mean) / normaliser.x_std)
-    scale = np.zeros(y.shape[1]) if gap_scale is None else gap_scale
+    drawn = system.simulate(key, x, DRAWS) if bank is None else np.moveaxis(np.asarray(bank.samples)[rows], -1, 0)
+    if 1 / (1 + len(drawn) // 2) > SURPRISING:
+        return None
+    samples, targets = (drawn - y_mean) / y_std, (y - y_mean) / y_std  # (N, m, dy), (m, dy)
+    noise = measurement_noise(system, x, noise_std, key) / y_std
+    at = jnp.asarray((x - normaliser.x_mean) / normaliser.x_std, jnp.float64)
+    scale = np.zeros(y.shape[1]) if gap_scale is None else np.asarray(gap_scale, float)
     known = np.asarray(setting.prior.covariance(at, jnp.asarray(scale)), float)  # with the white model error
+    white = known[:, 0, 0] - scale**2
+    # one row among all of them lies further out with probability SURPRISING
+    wider = ndtri(1 - SURPRISING / (2 * targets.size))
     checks, table = [], dict[str, list]()
     for i, (name, unit) in enumerate(zip(system.encoding.y_names, system.encoding.y_units, strict=True)):
-        own, measured = samples[:, :, i], targets[:, i]
-        low, high = own.min(axis=0) - WIDER * noise[i], own.max(axis=0) + WIDER * noise[i]
-        white = np.diag(np.full(len(x), known[i, 0, 0] - scale[i] ** 2 + noise[i] ** 2))
-        distance, p = _surprise(own, measured, white)
-        with_gap = (
-            (None, None) if gap_scale is None else _surprise(own, measured, known[i] + noise[i] ** 2 * np.eye(len(x)))
-        )
-        outside = (measured < low) | (measured > high)
+        own, measured, variance = samples[:, :, i], targets[:, i], noise[:, i] ** 2
+        margin = wider * np.sqrt(variance + white[i])
+        outside = (measured < own.min(axis=0) - margin) | (measured > own.max(axis=0) + margin)
+        distance, p = _surprise(own, measured, np.diag(variance + white[i]))
+        with_gap = (None, None) if gap_scale is None else _surprise(own, measured, known[i] + np.diag(variance))
         checks.append(OutputCheck(name, unit, int(outside.sum()), len(x), distance, p, *with_gap))
-        quantiles = np.quantile(own, [0, BAND[0], 0.5, BAND[1], 1], axis=0)
+        quantiles = np.quantile(own, [0, BAND[0], 0.5, BAND[1], 1], axis=0) * y_std[i] + y_mean[i]
         for column, values in {
             "row": rows,
             "output": [name] * len(x),
             "unit": [unit] * len(x),
             "measured": y[:, i],
-            **{
-                column: q * y_std[i] + y_mean[i]
-                for column, q in zip(("lowest", "low", "median", "high", "highest"), quantiles, strict=True)
-            },
+            **dict(zip(("lowest", "low", "median", "high", "highest"), quantiles, strict=True)),
+            "noise_std": noise[:, i] * y_std[i],
             "outside": outside,
         }.items():
             table.setdefault(column, []).extend(np.asarray(values).tolist())
     return PriorCheck(tuple(checks), table)
+
+
+def measurement_noise(system: System, x: np.ndarray, noise_std: Mapping[str, float], key: PRNGKeyArray) -> np.ndarray:
+    """Return the standard deviation of measured targets about those of a right simulator at the measured inputs, (m, dy).
+
+    The simulator starts from a measured state, so that state's noise counts, too, by what the simulator makes of it:
+    sigma_i^2 + sum_s (d next_i / d s)^2 sigma_s^2. Where it can only be queried, d next / d s is taken for 1.
+    """
+    encoding = system.encoding
+    own = encoding.per_target(noise_std, 0.0)
+    changes = np.arange(encoding.dim_y) < encoding.dim_state
+    if system.transition is None:
+        return np.broadcast_to(np.where(changes, 2**0.5, 1.0) * own, (len(x), encoding.dim_y))
+    states, inputs = encoding.split_x(x)
+    before = system.simulate(key, x, NOISE_DRAWS).mean(axis=0)
+    variance = np.zeros_like(before) + own**2
+    for j, q in enumerate(encoding.states):
+        sigma = noise_std.get(q.name) or 0.0
+        if sigma == 0:
+            continue
+        moved = states.copy()
+        moved[:, j] += sigma
+        x_moved = encoding.to_x(moved, inputs)
+        response = system.simulate(key, x_moved, NOISE_DRAWS).mean(axis=0) - before
+        response[:, changes] += (x_moved - x)[:, : encoding.dim_state]  # of the next state, not of the change
+        variance += response**2
+    return np.sqrt(variance)
 
 
 def _surprise(drawn: np.ndarray, measured: np.ndarray, rest: np.ndarray) -> tuple[float, float]:

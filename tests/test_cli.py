@@ -44,7 +44,8 @@ class TestFit:
         names = {str(p.relative_to(fitted)) for p in fitted.rglob("*") if p.is_file()}
         expected = {
             "manifest.json", "config.yaml", "metrics.parquet", "predictions.parquet", "calibration.parquet",
-            "horizon.parquet", "trajectories.parquet", "checkpoint/state.safetensors", "run.log", "report.html",
+            "horizon.parquet", "trajectories.parquet", "prior_predictive.parquet", "checkpoint/state.safetensors", "run.log",
+            "report.html",
             ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml",
         }  # fmt: skip
         assert expected <= names

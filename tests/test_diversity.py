@@ -13,6 +13,11 @@ def test_all_alike_are_one_and_all_apart_are_all() -> None:
     assert effective_number(20.0 * np.arange(7)[:, None, None] * np.ones((7, 5, 2))) == pytest.approx(7.0)
 
 
+def test_two_that_are_one_noise_apart_count_as_the_docstring_says_and_a_nan_is_no_number() -> None:
+    assert effective_number(np.stack([np.zeros((4, 3)), np.ones((4, 3))])) == pytest.approx(1.64, abs=0.01)
+    assert np.isnan(effective_number(np.full((2, 4, 3), np.nan)))
+
+
 def test_two_groups_are_two_and_a_lonely_one_counts_less() -> None:
     h = np.zeros((8, 3, 1))
     h[4:] = 30.0

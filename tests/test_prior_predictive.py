@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from simpel_cli.inference import NoiseModel
+from simpel_cli.inference import Bank, NoiseModel, Setting
 from simpel_cli.prior import GapGP, SimulatorPrior
-from simpel_cli.prior_predictive import SURPRISING, PriorCheck, check_prior
+from simpel_cli.prior_predictive import SURPRISING, PriorCheck, check_prior, measurement_noise
 from simpel_cli.problem import System, assemble, normaliser_of, system_of
 from simpel_cli.run import stream
 from simpel_cli.scores.gaussian import Gaussian
@@ -33,12 +33,13 @@ def checked(system: System, y: np.ndarray, x: np.ndarray, gap: bool = True) -> P
     prior = SimulatorPrior(gap=GapGP() if gap else None)
     assembled = assemble(
         system, normaliser, prior, Gaussian(), [(x[:, None], y[:, None])], {"f": NOISE}, {"f": NOISE}, noise=NoiseModel(),
-        pool=64, keys=[stream(0, "prior")], precision="float64",
+        pool=64, keys=[stream(0, "prior")], precision="float32",
     )  # fmt: skip
     kappa = np.asarray(assembled.problems.gap_scale[0]) if gap else None
-    noise = np.array([NOISE]) / np.asarray(normaliser.y_std)
-    judge = partial(check_prior, system, assembled.setting, normaliser, x[:, None], y[:, None], noise)
-    return judge(kappa, stream(0, "prior_predictive"))
+    judge = partial(check_prior, system, assembled.setting, normaliser, x[:, None], y[:, None], {"f": NOISE})
+    found = judge(kappa, stream(0, "prior_predictive"))
+    assert found is not None
+    return found
 
 
 def test_data_of_the_prior_itself_surprise_as_often_as_they_should(ramp: System) -> None:
@@ -91,3 +92,41 @@ def test_a_gap_explains_what_the_simulator_cannot(ramp: System) -> None:
     assert found.explained
     assert found.distance_with_gap is not None
     assert found.distance_with_gap < 2
+
+
+def test_the_noise_of_the_state_that_a_step_starts_from_counts_as_the_simulator_makes_it() -> None:
+    """x' = A x with a speed that decays: a change carries sigma^2 + (A sigma^2 A')_ii."""
+    declared = Declared(
+        "glider", dt=0.5,
+        states={"s": {"unit": "m", "range": [-1, 1]}, "v": {"unit": "m/s", "range": [-5, 5]}},
+        inputs={"u": {"unit": "N", "range": [-1, 1]}},
+        parameters={"b": {"range": [0.9, 1.1], "unit": "1/s"}},
+        dynamics={"s": "v", "v": "u - b*v"},
+    ).model()  # fmt: skip
+    system = system_of(declared, (), 0)
+    x = np.random.default_rng(0).uniform(-1, 1, (6, 3))
+    found = measurement_noise(system, x, {"s": 1e-4, "v": 0.05}, jax.random.key(0))
+    decay = np.exp(-0.5)
+    wanted = [np.hypot(np.hypot(1e-4, 1e-4), (1 - decay) * 0.05), 0.05 * np.hypot(1, decay)]
+    np.testing.assert_allclose(found, np.tile(wanted, (6, 1)), rtol=0.03)
+    assert measurement_noise(system, x, {}, jax.random.key(0)).max() == 0
+
+
+def test_of_a_bank_its_first_rows_count_and_few_draws_tell_nothing(ramp: System) -> None:
+    x = np.linspace(-0.9, 0.9, 5)
+    normaliser = normaliser_of(ramp, stream(0, "normaliser"))
+    setting = Setting(
+        SimulatorPrior(gap=None).bind(ramp.transition, 1, 1, np.asarray(normaliser.x_std)), Gaussian(), lambda *_: x
+    )  # type: ignore[arg-type, return-value]
+    drawn = np.moveaxis(ramp.simulate(jax.random.key(3), np.concatenate([x, [0.1] * 20])[:, None], 1000), 0, -1)
+    judge = partial(
+        check_prior, ramp, setting, normaliser, x[:, None], np.tanh(x)[:, None], {"f": NOISE}, None, jax.random.key(1)
+    )
+    found = judge(Bank(np.zeros((25, 1)), drawn))
+    assert found is not None
+    assert found.outputs[0].explained
+    np.testing.assert_allclose(found.table["lowest"], drawn[:5, 0].min(axis=-1), rtol=1e-6)
+    assert judge(Bank(np.zeros((25, 1)), drawn[:, :, :100])) is None
+    lost = judge(Bank(np.zeros((25, 1)), drawn + 1.0))
+    assert lost is not None
+    assert not lost.outputs[0].explained

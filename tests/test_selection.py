@@ -1,7 +1,9 @@
 """What a search makes of fits, with fits that are made up."""
 
 from collections.abc import Sequence
+from inspect import unwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -332,3 +334,22 @@ def test_a_base_that_had_not_found_its_place_is_left_for_a_better_one() -> None:
     assert none.chosen.terms == ()
     assert none.chosen.optimum.log_evidence > good.optimum.log_evidence - 1
     assert none.stages[0].before.optimum.log_evidence == none.chosen.optimum.log_evidence
+
+
+def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    judged: list[str] = []
+
+    def gated(_: Any, __: Any, selection: str, ___: Any) -> tuple[str, list[str], list[int]]:
+        judged.append(selection)
+        return selection, [selection], [1]
+
+    count = iter(range(100))
+    monkeypatch.setattr(discover, "_gated", gated)
+    monkeypatch.setattr(discover, "select", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=())))
+    monkeypatch.setattr(discover, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
+    none: Any = None
+    options: Any = SimpleNamespace(beginnings=0)
+    search: Any = SimpleNamespace(banned=set())
+    selection, gates = unwrap(discover._selected)(search, none, none, options, none)
+    assert len(judged) == discover.MOST_SEARCHES
+    assert gates == [selection]

@@ -1,6 +1,7 @@
 """Forces that go with time: found with their period, and neither process noise nor a friction is taken for one."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,12 @@ from test_interactions import FRICTION, NOISE, ROWS
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.levels import Levels, evidence
+from simpel_cli.discovery.levels import Level, Levels, evidence
 from simpel_cli.discovery.remainder import remainder_of
 from simpel_cli.discovery.search import Search
 from simpel_cli.discovery.selection import select
 from simpel_cli.discovery.setup import setup
-from simpel_cli.discovery.swings import swing
+from simpel_cli.discovery.swings import _evidence, _told, swing
 from simulators.model import Declared
 
 PERIOD = 0.9  # s
@@ -33,6 +34,20 @@ def test_evidence_is_that_of_a_linear_model_with_normal_weights() -> None:
     ]
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
     assert evidence(np.full((1, 1), np.nan), np.zeros(1), np.ones(2)).tolist() == [-np.inf, -np.inf]
+
+
+def wandering(correlation: float, std: float, seed: int) -> Callable[[float, float, float], float]:
+    """Return an Ornstein-Uhlenbeck force; time starts anew with every episode."""
+    random, now, before = np.random.default_rng(seed), 0.0, 0.0
+
+    def force(t: float, _: float, __: float) -> float:
+        nonlocal now, before
+        decay = np.exp(-max(t - before, 0.0) / correlation)
+        now = now * decay + std * np.sqrt(1 - decay**2) * random.normal() if t > before else std * random.normal()
+        before = t
+        return float(now)
+
+    return force
 
 
 def pushed(force: Callable[[float, float, float], float], shaken: float, seed: int) -> Levels:
@@ -65,6 +80,31 @@ def pushed(force: Callable[[float, float, float], float], shaken: float, seed: i
     return Levels(search, Assessor(plan, 10), select(search).chosen)
 
 
+def test_evidence_of_windows_is_that_of_the_dense_equations() -> None:
+    """Three windows, two frequencies, known unknowns that tie the windows together."""
+    random = np.random.default_rng(0)
+    count, rows, frequencies, unknowns = 3, 8, 2, 4
+    columns = random.normal(size=(count, rows, 2, frequencies))
+    known = np.linalg.qr(random.normal(size=(count * rows, unknowns)))[0]
+    error = random.normal(size=count * rows)
+    error -= known @ (known.T @ error)
+    track: Any = None
+    shape = (count, rows, 1)
+    level = Level(
+        0.0, track, error.reshape(shape), error.reshape(shape), known.reshape(*shape, unknowns), np.ones(shape)
+    )
+    sizes = np.array([0.3, 2.0])
+    found, weights = _evidence(_told(level, columns), sizes)
+    for f in range(frequencies):
+        dense = np.zeros((count, rows, count, 2))
+        dense[np.arange(count), :, np.arange(count)] = columns[..., f]
+        free = dense.reshape(count * rows, -1)
+        free = free - known @ (known.T @ free)
+        np.testing.assert_allclose(found[f], evidence(free.T @ free, free.T @ error, sizes), rtol=1e-9)
+        posterior = np.linalg.solve(free.T @ free + np.eye(2 * count) / sizes[-1] ** 2, free.T @ error)
+        np.testing.assert_allclose(weights[f].ravel(), posterior, rtol=1e-8)
+
+
 @pytest.mark.parametrize("shaken", [0.0, 0.2])
 def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
     levels = pushed(lambda t, phase, _: 0.5 * np.sin(2 * np.pi * t / PERIOD + phase), shaken, 0)
@@ -72,12 +112,26 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
     assert found is not None
     assert found.acts_on == "v"
     assert found.period == pytest.approx(PERIOD, rel=0.1)
-    assert found.rms == pytest.approx(0.5 / np.sqrt(2), rel=0.3)
+    assert found.rms == pytest.approx(0.5 / np.sqrt(2), rel=0.35)
     selection = select(levels.search)
     learnt = levels.assessor(selection.chosen.optimum.z, levels.search.plan.windows)
     told = remainder_of(levels.search, selection._replace(remainder=None), found, learnt)
     assert told is not None
     assert (told["depends_on"], told["period"], told["unit"]) == (["time"], found.period, "m/s^2")
+    assert "as u does" not in told["description"]
+
+
+@pytest.mark.parametrize("correlation", [0.3, 1.0])
+def test_a_force_that_wanders_has_no_period(correlation: float) -> None:
+    found = swing(pushed(wandering(correlation, 1.0, 5), 0.0, 3))
+    assert found is None or found.period is None
+
+
+def test_a_load_of_every_episode_is_no_swing() -> None:
+    found = swing(pushed(lambda _, phase, __: 0.4 * (phase - np.pi), 0.0, 4))
+    assert found is not None
+    assert found.period is None
+    assert found.rms == pytest.approx(0.4 * np.pi / 3**0.5, rel=0.5)  # four loads
 
 
 @pytest.mark.parametrize(("friction", "shaken"), [(0.0, 0.0), (0.0, 0.3), (0.4, 0.0)])

@@ -211,10 +211,11 @@ def _selected(
 ) -> tuple[Selection, list[Gate]]:
     """Search, and go on without an effect that does harm: another one may be what it stood for."""
     selection = select(search, base, options.beginnings)
-    for _ in range(MOST_SEARCHES):
+    for attempt in range(MOST_SEARCHES):
         selection, judged, harmful = _gated(search, assessor, selection, terminal)
-        search.banned.update(harmful)
-        left, selection = selection, further(search, selection) if harmful else selection
+        if not harmful or attempt == MOST_SEARCHES - 1:  # what is returned has been judged
+            break
+        left, selection = selection, further(search, selection)
         if selection.chosen.terms == left.chosen.terms:
             break
     return selection, judged
@@ -244,6 +245,7 @@ def _gated(
             return selection, judged, harmful
         if judged[gone].harm:
             harmful.append(chosen.terms[gone])
+            search.banned.add(chosen.terms[gone])  # nor is it another name for what stays
         selection = refused(search, selection, gone)
     return selection, [], harmful
 

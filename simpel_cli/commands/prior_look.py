@@ -10,26 +10,16 @@ from simpel_cli.run import stream
 
 
 def look_at_prior(study: Study, fitted: Fitted) -> PriorCheck | None:
-    """Compare the training targets of the first seed with draws of the prior; None where no simulator is in it."""
+    """Compare the training targets of the first seed with draws of the prior; None where there is nothing to compare."""
     if not study.prior.uses_simulator:
         return None
     problem = jax.tree.map(lambda a: np.asarray(a[0]), fitted.assembled.problems)
     x, y = fitted.training[0]
-    encoding = study.system.encoding
-    # a change is the difference of two measurements, an output is one
-    measured = np.where(np.arange(encoding.dim_y) < encoding.dim_state, 2**0.5, 1.0)
-    noise = measured * encoding.per_target(study.recording.noise_std, 0.0) / np.asarray(fitted.normaliser.y_std)
+    gap_scale = None if study.prior.gap is None else problem.gap_scale
     return check_prior(
-        study.system,
-        fitted.assembled.setting,
-        fitted.normaliser,
-        x,
-        y,
-        noise,
-        None if study.prior.gap is None else problem.gap_scale,
-        stream(0, "prior_predictive"),
-        problem.bank,
-    )
+        study.system, fitted.assembled.setting, fitted.normaliser, x, y, study.recording.noise_std, gap_scale,
+        stream(0, "prior_predictive"), problem.bank,
+    )  # fmt: skip
 
 
 def describe_prior(terminal: Terminal, checked: PriorCheck) -> None:

@@ -56,7 +56,7 @@ def _kappa(study: Study, fitted: Fitted) -> str:
 
 def _distinct(study: Study, numbers: list[float]) -> str:
     low, high = f"{min(numbers):.3g}", f"{max(numbers):.3g}"
-    return f"{low if low == high else f'{low}..{high}'} of {study.method.particles}; closer than the noise counts as the same"
+    return f"{low if low == high else f'{low}..{high}'} of {study.method.particles} at the scale of the noise"
 
 
 def _per_output(study: Study, values: np.ndarray) -> str:

@@ -11,6 +11,8 @@ from simpel_cli.discovery.swings import Swing
 from simpel_cli.discovery.whiteness import memory
 from simulators.effects.expression import per
 
+ALIKE = 0.3  # of an input's variance, at the period of a swing
+
 
 def remainder_of(
     search: Search, selection: Selection, swing: Swing | None, learnt: Assessment
@@ -25,6 +27,12 @@ def remainder_of(
     """
     found = _function(search, selection) or (swing and _swinging(search, swing))
     return found or _followed(search, selection.chosen, learnt)
+
+
+def dependence(remainder: dict[str, Any]) -> str:
+    """Return what a remainder depends on, in words."""
+    period = remainder.get("period")
+    return ", ".join(remainder["depends_on"]) + (f", with a period of about {period:.3g} s" if period else "")
 
 
 def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
@@ -46,6 +54,11 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
 
 
 def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
+    how = (
+        "wanders with time: it has no single period"
+        if swing.period is None
+        else f"swings with time, with a period of about {swing.period:.3g} s{_like(search, swing.period)}"
+    )
     return {
         "acts_on": swing.acts_on,
         "depends_on": ["time"],
@@ -53,9 +66,22 @@ def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
         "unit": _unit(search, swing.acts_on),
         "log_evidence_gain": swing.gain,
         "period": swing.period,
-        "description": f"something acts on d({swing.acts_on})/dt that is no function of the states and inputs of the model but "
-        f"swings with time, with a period of about {swing.period:.3g} s",
+        "description": f"something acts on d({swing.acts_on})/dt, or on a sensor of it, that {how}",
     }
+
+
+def _like(search: Search, period: float) -> str:
+    """Say which inputs have the same period: then it may be a function of them after all."""
+    model, plan = search.plan.augmented.model, search.plan
+    rows = plan.windows.ok.shape[1]
+    u = plan.windows.u[:, plan.lead : plan.lead + rows]
+    phase = 2 * np.pi * model.dt / period * np.arange(rows)
+    waves = np.stack([np.ones(rows), np.cos(phase), np.sin(phase)], axis=1)
+    left = u - np.einsum("tk,wkj->wtj", waves, np.linalg.pinv(waves) @ u)
+    spread = ((u - u.mean(axis=1, keepdims=True)) ** 2).sum(axis=(0, 1))
+    names = [q.name for q, all_of_it, rest in zip(model.inputs, spread, (left**2).sum(axis=(0, 1)), strict=True)
+             if rest < (1 - ALIKE) * all_of_it]  # fmt: skip
+    return f", as {' and '.join(names)} does, of which it may be a function" if names else ""
 
 
 def _unit(search: Search, state: str) -> str:

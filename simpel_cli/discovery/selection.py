@@ -72,7 +72,8 @@ def further(search: Search, found: Selection) -> Selection:
     """Go on from what is left of a selection whose lost effects are candidates no more: another may take their place."""
     grown = _grow(search, found.path)
     stages = found.stages + grown.stages
-    if grown.path[-1].terms == found.chosen.terms:
+    risen = grown.path[-1].optimum.log_evidence - found.chosen.optimum.log_evidence
+    if grown.path[-1].terms == found.chosen.terms and risen < ASTRAY:
         return found._replace(stages=stages, remainder=found.remainder or grown.remainder)
     return _settled(search, grown._replace(stages=stages))
 

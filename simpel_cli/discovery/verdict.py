@@ -7,7 +7,7 @@ import numpy as np
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.assess import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.gate import Gate
-from simpel_cli.discovery.remainder import noise_of
+from simpel_cli.discovery.remainder import dependence, noise_of
 from simpel_cli.discovery.search import Search, Trial, asked
 from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.setup import Q_BOUNDS, key_of
@@ -218,7 +218,7 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
     gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
     parts = [_phrase(e) for e in found["effects"]]
     listed = " and ".join(parts)
-    rest = f" What is left depends on {', '.join(found['remainder']['depends_on'])}." if found["remainder"] else ""
+    rest = f" What is left depends on {dependence(found['remainder'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"

@@ -23,6 +23,8 @@ def searched(words: Sequence[str], directory: Path, environment: Mapping[str, st
     Raises:
         SystemExit: it failed.
     """
+    if not (directory / FILE).exists() and (directory / "verdict.json").exists():
+        raise SystemExit(f"{directory} holds a verdict without its cost ({FILE}); remove it, or choose another --out")
     if not (directory / FILE).exists():
         command = [sys.executable, "-m", "simpel_cli.main", "discover", *words, f"hydra.run.dir='{directory}'"]
         process = subprocess.Popen(command, env=os.environ | dict(environment or {}), stdout=subprocess.DEVNULL)

@@ -43,6 +43,11 @@ def node(group: str, name: str) -> dict:
     }
 
 
+def scale_of(word: str) -> str | float:
+    """Return what a word on the command line says of the gap's scale."""
+    return word if word in ("declared", "auto") else float(word)
+
+
 def prior_of(method: str, scale: str | float) -> SimulatorPrior | GPPrior:
     """Return the prior that the method's YAML chooses, with the published gap."""
     chosen = yaml.safe_load((conf_dir() / "method" / f"{method}.yaml").read_text())["defaults"][0]
@@ -55,12 +60,12 @@ def prior_of(method: str, scale: str | float) -> SimulatorPrior | GPPrior:
 
 def rule_of(method: str, steps: int, overrides: dict) -> Method:
     """Return the method of its YAML; those that train networks take the reference's number of steps."""
-    given = node("method", method) | overrides
+    given = node("method", method)
     if "residual" in given:
         given["residual"] |= {"steps": steps}
     elif "network" in given:
         given |= {"steps": steps}
-    return build(given, "method")
+    return build(given | overrides, "method")
 
 
 def fit(arrays: dict, method: str, score: str, steps: int, seeds: int, scale: str | float, overrides: dict) -> dict:
@@ -109,7 +114,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--score", choices=SCORES, default="gaussian")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--gap-scale", default="auto", help="declared, auto or a number")
+    parser.add_argument("--gap-scale", default="auto", type=scale_of, help="declared, auto or a number")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=JSON", help="fields of the method")
     options = parser.parse_args()
     configure(Settings())
