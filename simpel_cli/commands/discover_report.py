@@ -227,7 +227,7 @@ def remainder_section(found: Mapping[str, Any]) -> Section:
     size = f", with a root mean square of {rms:.3g} {rest['unit']}" if np.isfinite(rms) else ""
     return {
         "title": "What is left unexplained",
-        "note": f"Something acts on d({rest['acts_on']})/dt that depends on {', '.join(rest['depends_on'])}{size}, and no "
+        "note": f"Something acts on d({rest['acts_on']})/dt that depends on {dependence(rest)}{size}, and no "
         "effect of the catalogue explains it. The figure of the latent force shows its shape; an effect of your own is one "
         "YAML file with an expression (conf/effect/).",
     }

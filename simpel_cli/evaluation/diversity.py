@@ -22,7 +22,7 @@ def distinct_particles(posterior: Posterior, x: np.ndarray) -> float:
 
 
 def effective_number(h: np.ndarray) -> float:
-    """Return the effective number of distinct members; h: (L, n, dy), a distance of 1 in every value is one of 1. NaN: one is not finite."""
+    """Return the effective number of distinct members of h, (L, n, dy) in units of the noise; NaN: one is not finite."""
     flat = h.reshape(len(h), -1) - h.reshape(len(h), -1).mean(axis=0)
     if not np.isfinite(flat).all():
         return float("nan")
