@@ -139,6 +139,7 @@ def publish(
         terminal.line(f"{'' if label else ' ' * 10}{line}", label)
 
 
+NO_INTERVAL = [float("nan")]  # of what is no mean over test points
 Values = dict[tuple[str, str], tuple[float, float, float]]
 
 
@@ -151,8 +152,8 @@ def _by_metric(rows: list[dict[str, Any]]) -> Values:
     return {
         (metric, output): (
             float(np.mean(grouped[metric, output])),
-            min(grouped[f"{metric}_low", output]),
-            max(grouped[f"{metric}_high", output]),
+            min(grouped.get((f"{metric}_low", output), NO_INTERVAL)),
+            max(grouped.get((f"{metric}_high", output), NO_INTERVAL)),
         )
         for metric, output in plain
     }
