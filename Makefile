@@ -15,8 +15,7 @@ OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train \
-	reproduce-sinusoids reproduce-bimodal
+.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'

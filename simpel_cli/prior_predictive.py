@@ -140,15 +140,15 @@ def measurement_noise(system: System, x: np.ndarray, noise_std: Mapping[str, flo
     encoding = system.encoding
     own = encoding.per_target(noise_std, 0.0)
     changes = np.arange(encoding.dim_y) < encoding.dim_state
+    noisy = [(j, noise_std[q.name]) for j, q in enumerate(encoding.states) if noise_std.get(q.name)]
+    if not noisy:
+        return np.broadcast_to(own, (len(x), encoding.dim_y))
     if system.transition is None:
         return np.broadcast_to(np.where(changes, 2**0.5, 1.0) * own, (len(x), encoding.dim_y))
     states, inputs = encoding.split_x(x)
     before = system.simulate(key, x, NOISE_DRAWS).mean(axis=0)
     variance = np.zeros_like(before) + own**2
-    for j, q in enumerate(encoding.states):
-        sigma = noise_std.get(q.name) or 0.0
-        if sigma == 0:
-            continue
+    for j, sigma in noisy:
         moved = states.copy()
         moved[:, j] += sigma
         x_moved = encoding.to_x(moved, inputs)

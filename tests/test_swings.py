@@ -1,6 +1,7 @@
 """Forces that go with time: found with their period, and neither process noise nor a friction is taken for one."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from simpel_cli.discovery.search import Search
 from simpel_cli.discovery.selection import select
 from simpel_cli.discovery.setup import setup
 from simpel_cli.discovery.swings import _evidence, _told, swing
-from simulators.model import Declared
+from simulators.model import Declared, Model
 
 PERIOD = 0.9  # s
 
@@ -50,6 +51,18 @@ def wandering(correlation: float, std: float, seed: int) -> Callable[[float, flo
     return force
 
 
+@cache
+def glider() -> Model:
+    """Of one model searches share their programs."""
+    return Declared(
+        "glider", dt=DT,
+        states={"s": {"unit": "m", "range": [-9, 9]}, "v": {"unit": "m/s", "range": [-5, 5]}},
+        inputs={"u": {"unit": "V", "range": [-9, 9]}},
+        parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
+        dynamics={"s": "v", "v": "b*u - 0.7*v"},
+    ).model()  # fmt: skip
+
+
 def pushed(force: Callable[[float, float, float], float], shaken: float, seed: int) -> Levels:
     """Search episodes of dv/dt = 1.3 u - 0.7 v + force(t, phase, v), each with its own phase, by a simulator without it."""
     random, fine, episodes = np.random.default_rng(seed), 20, []
@@ -68,14 +81,7 @@ def pushed(force: Callable[[float, float, float], float], shaken: float, seed: i
         episodes.append(Episode(f"{k}", np.arange(ROWS) * DT, measured, inputs[:, None], np.zeros((ROWS, 0))))
     checks = (Check("c", True, ""),)
     data = Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"s": NOISE, "v": NOISE}, (), checks, ())
-    glider = Declared(
-        "glider", dt=DT,
-        states={"s": {"unit": "m", "range": [-9, 9]}, "v": {"unit": "m/s", "range": [-5, 5]}},
-        inputs={"u": {"unit": "V", "range": [-9, 9]}},
-        parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
-        dynamics={"s": "v", "v": "b*u - 0.7*v"},
-    ).model()  # fmt: skip
-    plan = setup(glider, data, (), [FRICTION], 2)
+    plan = setup(glider(), data, (), [FRICTION], 2)
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
     return Levels(search, Assessor(plan, 10), select(search).chosen)
 
