@@ -1,5 +1,6 @@
 """Estimators that see more than two moments, against exact scores and against plain linear algebra."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
