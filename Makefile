@@ -71,10 +71,10 @@ reproduce-metrics_vs_n_train: install ## Make the README's figure anew (36 fits)
 		hydra.sweep.dir=runs/reproduce/metrics_vs_n_train-$(shell date +%Y%m%d-%H%M%S)
 	@echo "the figure lies in runs/reproduce; the README shows docs/figures/metrics_vs_n_train.png"
 
-reproduce-sinusoids: install ## Make the paper's figure of sinusoids: five methods on two points (about 5 minutes)
+reproduce-sinusoids: install ## Make the paper's figure of sinusoids: six fits of two points
 	$(BIN)/python -m tests.reproduce.sinusoids
 
-reproduce-bimodal: install ## Make the paper's figure of two modes: four score estimators (about 10 minutes)
+reproduce-bimodal: install ## Make the paper's figure of two modes: four score estimators, two also as published
 	$(BIN)/python -m tests.reproduce.bimodal
 
 lock: ## Write uv.lock against the public index only

@@ -66,8 +66,8 @@ def caveats(found: dict[str, Any]) -> str:
     name, most = max(found["error"]["surprise"].items(), key=lambda entry: np.nan_to_num(entry[1]))
     if most > SURPRISING:
         text += (
-            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times what the model expects: they go "
-            "where the training episodes did not."
+            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times what the model expects: they may "
+            "go where the training episodes did not."
         )
     return text
 
