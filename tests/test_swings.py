@@ -14,11 +14,11 @@ from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.fit import Fitter
 from simpel_cli.discovery.levels import Level, Levels, evidence
-from simpel_cli.discovery.remainder import remainder_of
+from simpel_cli.discovery.remainder import dependence, remainder_of
 from simpel_cli.discovery.search import Search
-from simpel_cli.discovery.selection import select
+from simpel_cli.discovery.selection import Selection, select
 from simpel_cli.discovery.setup import setup
-from simpel_cli.discovery.swings import _evidence, _told, swing
+from simpel_cli.discovery.swings import Swing, _evidence, _told, swing
 from simulators.model import Declared, Model
 
 PERIOD = 0.9  # s
@@ -86,6 +86,17 @@ def pushed(force: Callable[[float, float, float], float], shaken: float, seed: i
     return Levels(search, Assessor(plan, 10), select(search).chosen)
 
 
+def select_nothing(levels: Levels) -> Selection:
+    return Selection(levels.chosen, levels.chosen, (levels.chosen,), (), (), (), None)
+
+
+def said(levels: Levels, found: Swing) -> dict[str, Any]:
+    learnt = levels.assessor(levels.chosen.optimum.z, levels.search.plan.windows)
+    told = remainder_of(levels.search, select_nothing(levels), found, learnt)
+    assert told is not None
+    return told
+
+
 def test_evidence_of_windows_is_that_of_the_dense_equations() -> None:
     """Three windows, two frequencies, known unknowns that tie the windows together."""
     random = np.random.default_rng(0)
@@ -119,12 +130,19 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
     assert found.acts_on == "v"
     assert found.period == pytest.approx(PERIOD, rel=0.1)
     assert found.rms == pytest.approx(0.5 / np.sqrt(2), rel=0.35)
-    selection = select(levels.search)
-    learnt = levels.assessor(selection.chosen.optimum.z, levels.search.plan.windows)
-    told = remainder_of(levels.search, selection._replace(remainder=None), found, learnt)
-    assert told is not None
+    told = said(levels, found)
     assert (told["depends_on"], told["period"], told["unit"]) == (["time"], found.period, "m/s^2")
+    assert f"with a period of about {found.period:.3g} s" in told["description"]
     assert "as u does" not in told["description"]
+    # an input that swings in the same time is named
+    windows = levels.search.plan.windows
+    wave = np.sin(2 * np.pi * DT / found.period * np.arange(windows.u.shape[1]))[None, :, None]
+    levels.search.plan = levels.search.plan._replace(windows=windows._replace(u=0.3 * windows.u + 3 * wave))
+    alike = remainder_of(
+        levels.search, select_nothing(levels), found, levels.assessor(levels.chosen.optimum.z, windows)
+    )
+    assert alike is not None
+    assert alike["description"].endswith("as u does, of which it may be a function")
 
 
 @pytest.mark.parametrize("correlation", [0.3, 1.0])
@@ -134,9 +152,13 @@ def test_a_force_that_wanders_has_no_period(correlation: float) -> None:
 
 
 def test_a_load_of_every_episode_is_no_swing() -> None:
-    found = swing(pushed(lambda _, phase, __: 0.4 * (phase - np.pi), 0.0, 4))
+    levels = pushed(lambda _, phase, __: 0.4 * (phase - np.pi), 0.0, 4)
+    found = swing(levels)
     assert found is not None
     assert found.period is None
+    told = said(levels, found)
+    assert (told["period"], dependence(told)) == (None, "time")
+    assert told["description"].endswith("wanders with time: it has no single period")
     assert found.rms == pytest.approx(0.4 * np.pi / 3**0.5, rel=0.5)  # four loads
 
 

@@ -112,8 +112,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     selection, judged = _of_two(levels, selection, judged, attach, options, terminal)
     swinging = None if selection.remainder else swing(levels)
     if swinging is not None:
-        how = "wanders" if swinging.period is None else f"swings in {swinging.period:.3g} s"
-        terminal.line(f"a force on {swinging.acts_on} that {how} +{swinging.gain:.0f}", "search")
+        terminal.line(f"a force on {swinging.acts_on} {swinging.how} +{swinging.gain:.0f}", "search")
     before, after = (assessor(t.optimum.z, windows) for t in (selection.base, selection.chosen))
     found = verdict_of(
         search,

@@ -54,11 +54,6 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
 
 
 def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
-    how = (
-        "wanders with time: it has no single period"
-        if swing.period is None
-        else f"swings with time, with a period of about {swing.period:.3g} s{_like(search, swing.period)}"
-    )
     return {
         "acts_on": swing.acts_on,
         "depends_on": ["time"],
@@ -66,12 +61,15 @@ def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
         "unit": _unit(search, swing.acts_on),
         "log_evidence_gain": swing.gain,
         "period": swing.period,
-        "description": f"something acts on d({swing.acts_on})/dt, or on a sensor of it, that {how}",
+        "description": f"something acts on d({swing.acts_on})/dt, or on a sensor of it, "
+        f"that {swing.how}{_like(search, swing.period)}",
     }
 
 
-def _like(search: Search, period: float) -> str:
+def _like(search: Search, period: float | None) -> str:
     """Say which inputs have the same period: then it may be a function of them after all."""
+    if period is None:
+        return ""
     model, plan = search.plan.augmented.model, search.plan
     rows = plan.windows.ok.shape[1]
     u = plan.windows.u[:, plan.lead : plan.lead + rows]

@@ -40,6 +40,13 @@ class Swing(NamedTuple):
     rms: float
     gain: float
 
+    @property
+    def how(self) -> str:
+        """What it does, in words."""
+        if self.period is None:
+            return "wanders with time: it has no single period"
+        return f"swings with time, with a period of about {self.period:.3g} s"
+
 
 class Told(NamedTuple):
     """What the data tell of the weights c, s of W windows at F frequencies, at one level of the noise.
