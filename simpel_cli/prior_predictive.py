@@ -146,15 +146,15 @@ def measurement_noise(system: System, x: np.ndarray, noise_std: Mapping[str, flo
     if system.transition is None:
         return np.broadcast_to(np.where(changes, 2**0.5, 1.0) * own, (len(x), encoding.dim_y))
     states, inputs = encoding.split_x(x)
-    before = system.simulate(key, x, NOISE_DRAWS).mean(axis=0)
-    variance = np.zeros_like(before) + own**2
-    for j, sigma in noisy:
-        moved = states.copy()
-        moved[:, j] += sigma
-        x_moved = encoding.to_x(moved, inputs)
-        response = system.simulate(key, x_moved, NOISE_DRAWS).mean(axis=0) - before
-        response[:, changes] += (x_moved - x)[:, : encoding.dim_state]  # of the next state, not of the change
-        variance += response**2
+    moved = np.tile(states, (len(noisy), 1, 1))
+    for k, (j, sigma) in enumerate(noisy):
+        moved[k, :, j] += sigma
+    every = np.stack([x, *(encoding.to_x(each, inputs) for each in moved)])
+    # all in one call: the same draws of the parameters, and one program
+    means = system.simulate(key, every.reshape(-1, encoding.dim_x), NOISE_DRAWS).mean(axis=0)
+    response = (means.reshape(len(every), len(x), -1) - means[: len(x)])[1:]
+    response[:, :, changes] += (every[1:] - x)[:, :, : encoding.dim_state]  # of the next state, not of the change
+    variance = own**2 + np.sum(response**2, axis=0)
     return np.sqrt(variance)
 
 

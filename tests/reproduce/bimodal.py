@@ -16,12 +16,11 @@ from simpel_cli.inference import ScoreEstimator
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.plots.canvas import COLOURS, new_figure, save
 from simpel_cli.prior import SimulatorPrior
-from simpel_cli.records import write_table, write_text
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod
 from simpel_cli.scores.ssge import SSGE
-from tests.reproduce.static import DRAWS, EXACT, SEEDS, Fitted, Task, draws, fit, folder, spread, task
+from tests.reproduce.static import DRAWS, EXACT, Fitted, Task, Told, draws, fit, folder, publish, task
 
 X = (-0.06935716, -1.3706367, -0.7339401)
 SLOPE = -0.55
@@ -34,6 +33,15 @@ ESTIMATORS: dict[str, ScoreEstimator] = {
     "nu-method": NuMethod(),
     "SSGE, published": SSGE(bandwidth=1.0, eta=0.1, baseline="none"),
     "nu-method, published": NuMethod(bandwidth=1.0, wider=1.0, weight=1e-4, baseline="none"),
+}
+
+
+TITLES = {
+    "up": "at slope 1",
+    "down": "at slope -1",
+    "neither": "at neither",
+    "bent": "bent on the right",
+    "left_rmse": "RMSE on the left",
 }
 
 
@@ -68,8 +76,7 @@ def draw(path: Path, given: Task, found: dict[str, Fitted]) -> None:
         least = order[np.argmax(np.cumsum(order, axis=0) >= 0.8 * order.sum(axis=0), axis=0), np.arange(len(GRID))]
         axis.contourf(GRID, levels, (density >= least).astype(float), levels=[0.5, 1.5], colors=[COLOURS[0]], alpha=0.2)
         axis.plot(GRID, one.particles[0].T, color=COLOURS[0], linewidth=0.7)
-        told = [figures(p) for p in one.particles]
-        up, down = (100 * np.mean([t[k] for t in told]) for k in ("up", "down"))
+        up, down = (100 * np.mean([figures(p)[k] for p in one.particles]) for k in ("up", "down"))
         axis.set_title(f"{name}: {up:.0f} % up, {down:.0f} % down", fontsize=9)
     for axis in axes:
         axis.plot(X, SLOPE * np.array(X), "o", color=COLOURS[1], markersize=4)
@@ -83,17 +90,16 @@ def draw(path: Path, given: Task, found: dict[str, Fitted]) -> None:
     save(figure, path)
 
 
-def claims(told: dict[str, list[dict[str, float]]], found: dict[str, Fitted]) -> list[str]:
+def claims(told: Told, found: dict[str, Fitted]) -> dict[str, bool]:
     """Check the paper's claims one by one."""
 
     def mean(name: str, key: str) -> float:
-        return float(np.mean([t[key] for t in told[name]]))
+        return float(np.mean(told[name][key]))
 
     def both(name: str) -> bool:
         return min(mean(name, "up"), mean(name, "down")) >= 0.2
 
-    prior = draws_bent()
-    checks = {
+    return {
         "the nu-method puts a fifth of its particles or more on each mode": both("nu-method"),
         "the nu-method's particles are lines on the right (bent by less than 0.1)": mean("nu-method", "bent") < 0.1,
         "the Gaussian cannot: less than a fifth on one of the modes": not both("Gaussian"),
@@ -103,15 +109,6 @@ def claims(told: dict[str, list[dict[str, float]]], found: dict[str, Fitted]) ->
         "the nu-method takes at most four times as long a step as KDE": found["nu-method"].ms_per_step
         <= 4 * found["KDE"].ms_per_step,
     }
-    return [f"* {'holds' if good else 'DOES NOT HOLD'}: {claim}" for claim, good in checks.items()] + [
-        f"* draws of the prior are bent by {prior:.2g}: they are lines"
-    ]
-
-
-def draws_bent() -> float:
-    """Return how much draws of the simulator are bent on the right, as `figures` has it."""
-    given = task("bimodal", 2.0, 1.5, X, SLOPE * np.array(X), GRID)
-    return figures(draws(given, 200))["bent"]
 
 
 def main() -> None:
@@ -136,30 +133,12 @@ def main() -> None:
     for name in options.only:
         found[name] = fit(given, SimulatorPrior(gap=None, draws=DRAWS), ESTIMATORS[name], rule)
         print(f"{name}: {found[name].seconds:.0f} s", flush=True)
-    told = {name: [figures(p) for p in one.particles] for name, one in found.items()}
-    keys = ("up", "down", "neither", "bent", "left_rmse")
-    rows = [(name, seed) for name in told for seed in range(SEEDS)]
-    write_table(
-        out / "bimodal.parquet",
-        {"estimator": [n for n, _ in rows], "seed": [s for _, s in rows]}
-        | {k: [told[n][s][k] for n, s in rows] for k in keys}
-        | {"ms_per_step": [found[n].ms_per_step for n, _ in rows]},
-    )
+    of_seeds = {name: [figures(p) for p in one.particles] for name, one in found.items()}
+    told = {name: {key: [seed[key] for seed in seeds] for key in TITLES} for name, seeds in of_seeds.items()}
     draw(out / "bimodal.png", given, found)
-    lines = [
-        "| estimator | at slope 1 | at slope -1 | at neither | bent on the right | RMSE on the left | ms a step | s, 5 seeds |",
-        "|---|---|---|---|---|---|---|---|",
-        *(
-            f"| {n} | {' | '.join(spread([t[k] for t in rows_of], 2) for k in keys)} "
-            f"| {found[n].ms_per_step:.2f} | {found[n].seconds:.0f} |"
-            for n, rows_of in told.items()
-        ),
-        "",
-        *(claims(told, found) if set(told) >= {"Gaussian", "KDE", "SSGE", "nu-method"} else []),
-    ]
-    text = "Shares of 20 particles; median, smallest and largest of 5 seeds.\n\n" + "\n".join(lines) + "\n"
-    write_text(out / "bimodal.md", text)
-    print(f"\n{text}\n{out / 'bimodal.png'}")
+    checks = claims(told, found) if set(told) >= {"Gaussian", "KDE", "SSGE", "nu-method"} else {}
+    bent = figures(draws(given, 200))["bent"]
+    publish(out, "bimodal", told, found, TITLES, checks, note=f"the prior's draws are lines: bent by {bent:.2g}")
 
 
 if __name__ == "__main__":

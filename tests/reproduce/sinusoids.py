@@ -19,11 +19,10 @@ from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
 from simpel_cli.plots.canvas import BLACK, COLOURS, new_figure, save
 from simpel_cli.prior import GPPrior, SimulatorPrior
-from simpel_cli.records import write_table, write_text
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod
-from tests.reproduce.static import DRAWS, EXACT, SEEDS, Fitted, Task, draws, fit, folder, spread, task
+from tests.reproduce.static import DRAWS, EXACT, Fitted, Task, Told, draws, fit, folder, publish, spread, task
 
 A, W, C = 1.4979174, 2.173156, 1.6382928  # truth
 X = (-4.7293234, 3.071438)
@@ -31,6 +30,13 @@ GRID = np.linspace(-5, 5, 200)
 COMMON: dict[str, Any] = {"learning_rate": 1e-3, "final_learning_rate": 1.0, "batch": 4, "noise": EXACT}
 SIMULATOR = SimulatorPrior(gap=None, draws=DRAWS)
 GP = GPPrior(lengthscale=0.2, scale=1.0)
+
+TITLES = {
+    "rmse": "RMSE on the grid",
+    "std": "spread of particles",
+    "inside": "inside 2 spreads",
+    "at_data": "off at the data",
+}
 
 
 def truth(x: np.ndarray) -> np.ndarray:
@@ -89,12 +95,12 @@ def draw(path: Path, given: Task, found: dict[str, Fitted]) -> None:
     save(figure, path)
 
 
-def claims(told: dict[str, dict[str, list[float]]]) -> list[str]:
+def claims(told: Told) -> dict[str, bool]:
     """Check the paper's claims one by one."""
     middle = {name: {k: float(np.median(v)) for k, v in row.items()} for name, row in told.items()}
     own = [n for n in middle if n in ("SimPEL, Gaussian", "SimPEL, nu-method")]
     others = [n for n in middle if not n.startswith("SimPEL")]
-    checks = {
+    return {
         "SVGD misses even the data (more than 0.5 off at a training point)": middle["SVGD"]["at_data"] > 0.5,
         "FSVGD is right at the data (within 0.5) and wide elsewhere (five times SimPEL's spread)": middle["FSVGD"][
             "at_data"
@@ -113,7 +119,6 @@ def claims(told: dict[str, dict[str, list[float]]]) -> list[str]:
         )
         >= 0.9,
     }
-    return [f"* {'holds' if good else 'DOES NOT HOLD'}: {claim}" for claim, good in checks.items()]
 
 
 def main() -> None:
@@ -129,27 +134,8 @@ def main() -> None:
         found[name] = fit(given, prior, score, rule)
         print(f"{name}: {found[name].seconds:.0f} s", flush=True)
     told = {name: figures(one) for name, one in found.items()}
-    rows = [(name, seed) for name in told for seed in range(SEEDS)]
-    write_table(
-        out / "sinusoids.parquet",
-        {"method": [n for n, _ in rows], "seed": [s for _, s in rows]}
-        | {k: [told[n][k][s] for n, s in rows] for k in ("rmse", "std", "inside", "at_data")},
-    )
     draw(out / "sinusoids.png", given, found)
-    lines = [
-        "| method | RMSE on the grid | spread of particles | inside 2 spreads | off at the data | ms a step | s, 5 seeds |",
-        "|---|---|---|---|---|---|---|",
-        *(
-            f"| {n} | {spread(t['rmse'])} | {spread(t['std'])} | {spread(t['inside'], 2)} | {spread(t['at_data'], 2)} "
-            f"| {found[n].ms_per_step:.2f} | {found[n].seconds:.0f} |"
-            for n, t in told.items()
-        ),
-        "",
-        *claims(told),
-    ]
-    text = "Median, smallest and largest of 5 seeds; y spans about 24.\n\n" + "\n".join(lines) + "\n"
-    write_text(out / "sinusoids.md", text)
-    print(f"\n{text}\n{out / 'sinusoids.png'}")
+    publish(out, "sinusoids", told, found, TITLES, claims(told), note="y spans about 24")
 
 
 if __name__ == "__main__":

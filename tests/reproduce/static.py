@@ -17,10 +17,12 @@ from simpel_cli.inference import Method, NoiseModel, Normaliser, ScoreEstimator
 from simpel_cli.nodes import build
 from simpel_cli.prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import System, assemble, system_of
+from simpel_cli.records import write_table, write_text
 from simpel_cli.run import Settings, configure, stream
 
 SEEDS = 5
 DRAWS = 256
+Told = dict[str, dict[str, list[float]]]  # method or estimator -> figure -> one value per seed
 EXACT = NoiseModel(learn=False, least_init=0.05)  # normalised; the data carry no noise
 
 
@@ -107,3 +109,43 @@ def folder(out: Path | None, name: str) -> Path:
 def spread(values: Sequence[float], digits: int = 3) -> str:
     """Return median, smallest and largest in words."""
     return f"{np.median(values):.{digits}g} ({min(values):.{digits}g}..{max(values):.{digits}g})"
+
+
+def publish(
+    where: Path, name: str, told: Told, found: dict[str, Fitted], titles: dict[str, str], checks: dict[str, bool],
+    *, note: str,
+) -> None:  # fmt: skip
+    """Write `name`.parquet and `name`.md: every figure of every seed, the table, the claims one by one.
+
+    Args:
+        where: folder.
+        name: of the figure.
+        told: figures of every method.
+        found: fits of every method.
+        titles: figure -> head of its column.
+        checks: claim -> whether it holds.
+        note: what the reader should know of the claims.
+    """
+    rows = [(method, seed) for method in told for seed in range(SEEDS)]
+    write_table(
+        where / f"{name}.parquet",
+        {"method": [m for m, _ in rows], "seed": [s for _, s in rows]}
+        | {key: [told[m][key][s] for m, s in rows] for key in titles}
+        | {"ms_per_step": [found[m].ms_per_step for m, _ in rows]},
+    )
+    lines = [
+        f"Median, smallest and largest of {SEEDS} seeds.\n",
+        f"| | {' | '.join(titles.values())} | ms a step | compile, s | s, {SEEDS} seeds |",
+        "|---" * (len(titles) + 4) + "|",
+        *(
+            f"| {m} | {' | '.join(spread(figures[key]) for key in titles)} | {found[m].ms_per_step:.2f} "
+            f"| {found[m].compile_seconds:.1f} | {found[m].seconds:.0f} |"
+            for m, figures in told.items()
+        ),
+        "",
+        *(f"* {'holds' if good else 'DOES NOT HOLD'}: {claim}" for claim, good in checks.items()),
+        f"* {note}",
+    ]
+    text = "\n".join(lines) + "\n"
+    write_text(where / f"{name}.md", text)
+    print(f"\n{text}\n{where / f'{name}.png'}")

@@ -1,0 +1,132 @@
+"""The published reference's own arrays (SIMPEL_SHARED/reference) as learning problems of this project.
+
+Simulators: pendulum_published; rc_car, the kinematic bicycle, with the action three steps old as its input, as the arrays
+have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 32 + 8 points, the reference's number of steps.
+"""
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import yaml
+from jaxtyping import Array, Key
+
+from simpel_cli.config import conf_dir
+from simpel_cli.inference import Method, Normaliser
+from simpel_cli.nodes import build
+from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.problem import Assembled, assemble, normaliser_of, system_of
+from simpel_cli.run import stream
+
+STEPS = {20: 5000, 50: 5000, 320: 7000, 400: 8000}  # of the reference, per training size
+SIMULATORS = {"pendulum": "pendulum_published", "rc_car": "rc_car"}
+# of the measurements per output component; of the car, that which the reference simulates
+NOISE = {
+    "pendulum": {"phi": 0.02, "omega": 0.02},
+    "rc_car": {"x": 1.1e-3, "y": 1.1e-3, "theta": 1.8e-3, "vx": 8.2e-3, "vy": 8.2e-3, "omega": 3.7e-2},
+}
+METHODS = (
+    "simpel", "simpel_only_sim", "map", "repulsive", "fsvgd", "ensemble", "svgd", "greybox", "sysid", "gp",
+)  # fmt: skip
+SCORES = ("gaussian", "kde", "ssge", "nu_method")
+
+
+class Case(NamedTuple):
+    """A learning problem, ready to be compiled.
+
+    Args:
+        rule: with the reference's number of steps.
+        assembled: problem arrays of every seed.
+        normaliser: of the system.
+        keys: one per seed.
+        arrays: of the reference.
+    """
+
+    rule: Method
+    assembled: Assembled
+    normaliser: Normaliser
+    keys: Key[Array, " seeds"]
+    arrays: dict[str, np.ndarray]
+
+    @property
+    def bind(self) -> Any:
+        """Problem -> rule."""
+        return partial(self.rule.bind, self.assembled.setting)
+
+
+def folder() -> Path:
+    """Return where the arrays lie."""
+    return Path(os.environ.get("SIMPEL_SHARED", "../shared")) / "reference"
+
+
+def sets() -> list[str]:
+    """Return the names of all sets that have scores."""
+    return sorted(p.stem for p in folder().glob("*_n*_s*.npz"))
+
+
+def node(group: str, name: str) -> dict[str, Any]:
+    """Return a YAML of conf/ without its defaults."""
+    given = yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
+    return {k: v for k, v in given.items() if k != "defaults"}
+
+
+def prior_of(method: str, scale: str | float, draws: int) -> SimulatorPrior | GPPrior:
+    """Return the prior that the method's YAML chooses, with the published gap."""
+    chosen = yaml.safe_load((conf_dir() / "method" / f"{method}.yaml").read_text())["defaults"][0]
+    (name,) = chosen.values()
+    if name == "gp":
+        return build(node("prior", "gp"), "prior")
+    gap = GapGP(lengthscale=10.0, lengthscale_units="raw", scale=scale) if name == "simulator" else None
+    return SimulatorPrior(gap=gap, draws=draws)
+
+
+def rule_of(method: str, steps: int, fields: dict[str, Any]) -> Method:
+    """Return the method of its YAML; those that train networks take the given number of steps."""
+    given = node("method", method)
+    if "residual" in given:
+        given["residual"] |= {"steps": steps}
+    elif "network" in given:
+        given |= {"steps": steps}
+    return build(given | fields, "method")
+
+
+def case(
+    name: str,
+    method: str = "simpel",
+    score: str = "gaussian",
+    *,
+    seeds: int = 1,
+    scale: str | float = "auto",
+    draws: int = 1028,
+    rows: int | None = None,
+    fields: dict[str, Any] | None = None,
+) -> Case:
+    """Return the problem of one set.
+
+    Args:
+        name: of the set, e.g. pendulum_n20_s0.
+        method, score: names of their YAML.
+        seeds: number of them.
+        scale: kappa of the gap: declared, auto or a number.
+        draws: N of the simulator.
+        rows: training rows, drawn with repeats from those of the set (to time other sizes); None: as they are.
+        fields: of the method.
+    """
+    arrays = dict(np.load(folder() / f"{name}.npz"))
+    kind, size = name.rsplit("_n", 1)
+    system = system_of(build(node("sim", SIMULATORS[kind]), "sim").model(), (), 0)
+    normaliser = normaliser_of(system, stream(0, "normaliser"))
+    rule = rule_of(method, STEPS[int(size.split("_")[0])], fields or {})
+    x, y = (np.asarray(arrays[k], float) for k in ("x_train", "y_train_diff"))
+    if rows is not None:
+        chosen = np.random.default_rng(0).integers(0, len(x), rows)
+        x, y = x[chosen], y[chosen]
+    assembled = assemble(
+        system, normaliser, prior_of(method, scale, draws), build(node("score", score), "score"), [(x, y)] * seeds,
+        NOISE[kind], NOISE[kind] if kind == "pendulum" else {}, noise=rule.noise, pool=rule.pool,
+        keys=[stream(s, "prior") for s in range(seeds)], precision="float32",
+    )  # fmt: skip
+    return Case(rule, assembled, normaliser, jnp.stack([stream(s, "train") for s in range(seeds)]), arrays)
