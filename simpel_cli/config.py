@@ -30,6 +30,20 @@ def example_data_dir() -> Path:
     return inside if inside.is_dir() else Path(__file__).parents[1] / "data"
 
 
+def recordings_dir() -> Path:
+    """Return the folder that SIMPEL_SHARED names: recordings that do not come with simpel; else `shared` beside a checkout.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    given = os.environ.get("SIMPEL_SHARED")
+    folder = Path(given).expanduser().absolute() if given else Path(__file__).parents[2] / "shared"
+    if not folder.is_dir():
+        tried = f"SIMPEL_SHARED is {given!r}, which" if given else f"SIMPEL_SHARED is not set, and {folder}"
+        raise ConfigError(f"{tried} is no folder. The recordings do not come with simpel: export SIMPEL_SHARED=FOLDER.")
+    return folder
+
+
 class Job(typing.NamedTuple):
     """One composed, resolved configuration."""
 
@@ -176,12 +190,13 @@ def dump(config: dict[str, Any]) -> str:
 
 
 def register_resolvers() -> None:
-    """Make `${simpel_data:}` (bundled measurements) and `${run_id:}` (a new hash per launch) available."""
+    """Make `${simpel_data:}`, `${simpel_shared:}` (measurements) and `${run_id:}` (a new hash per launch) available."""
     from omegaconf import OmegaConf
 
     run_id = secrets.token_hex(3)  # two starts in one second must never share a run directory
 
     OmegaConf.register_new_resolver("simpel_data", lambda: str(example_data_dir()), replace=True)
+    OmegaConf.register_new_resolver("simpel_shared", lambda: str(recordings_dir()), replace=True)
     OmegaConf.register_new_resolver("run_id", lambda: run_id, replace=True)
 
 

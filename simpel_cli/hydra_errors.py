@@ -102,6 +102,8 @@ def _interpolation(text: str, key: str) -> str:
         return f"the environment variable {found[1]} is not set: set it, or give a default, ${{oc.env:{found[1]},DEFAULT}}."
     if found := re.search(r"Unsupported interpolation type (.+)", text):
         return f"${{{found[1]}:...}} is unknown; allowed are ${{oc.env:NAME}}, ${{simpel_data:}} and ${{key}}."
+    if found := re.search(r"ConfigError raised while resolving interpolation: (.+)", text):
+        return found[1]
     if "Missing mandatory value" in text:
         return f"a value must be given (the YAML says ???), e.g. on the command line: {key}=VALUE."
     if found := re.search(r"(?:no viable alternative|mismatched|token recognition).*?'(\$\{.*)'", text):

@@ -77,3 +77,11 @@ def test_experiment_runs_on_its_recording(
     if experiment == "emps":  # two files, found again from the run's own configuration
         again = simpel(tmp_path, "evaluate", "run", "run.quiet=true")
         assert again.code == 0, again.err
+
+
+def test_recordings_that_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SIMPEL_SHARED", str(tmp_path / "nowhere"))
+    result = simpel(tmp_path, "fit", "experiment=rc_car")
+    assert result.code == 2
+    assert f"data.path: SIMPEL_SHARED is '{tmp_path / 'nowhere'}', which is no folder" in result.err
+    assert "export SIMPEL_SHARED=FOLDER" in result.err
