@@ -190,9 +190,11 @@ class NoiseModel:
     Args:
         learn: learn it, or keep the initial value.
         floor: smallest standard deviation when learned.
-        measured_share: nor does it fall below this share of the measurement noise that the data YAML declares. A network
-            that goes through every one of a few points would else learn that there is no noise. 0.7 is the sine's or
-            cosine's share of an angle's noise. (An estimate from the data is an upper bound, hence no floor.)
+        measured_share: nor does it fall below this share of the measurement noise that the data YAML declares. 0.7 is the
+            sine's or cosine's share of an angle's noise. (An estimate from the data is an upper bound, hence no floor.)
+        marginal_share: nor below this share of the noise with the largest marginal likelihood under the method's prior
+            (`gap.py`). A network that goes through every one of a few points would else learn that there is no noise;
+            where all functions that the prior allows are integrated out, it cannot. 0 switches that off.
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.
         rate: its learning rate as a multiple of the networks'. One number per output has far less to learn than a
@@ -202,6 +204,7 @@ class NoiseModel:
     learn: bool = True
     floor: float = 1e-3
     measured_share: float = 0.7
+    marginal_share: float = 1.0
     prior_std: float = 1.0
     least_init: float = 0.1
     rate: float = 10.0
@@ -211,7 +214,13 @@ class NoiseModel:
     ) -> tuple[Float[Numbers, " dy"], Float[Numbers, " dy"]]:
         """Return initial value and floor of sigma for a measured and a declared noise (0 where unknown)."""
         init = np.maximum(measured, self.least_init)
-        return init, np.clip(self.measured_share * np.asarray(declared), self.floor, 0.99 * init)
+        return init, self.raised(self.floor, self.measured_share * np.asarray(declared), init)
+
+    def raised(
+        self, floor: Float[Numbers, " dy"] | float, least: Float[Numbers, " dy"], init: Float[Numbers, " dy"]
+    ) -> Float[Numbers, " dy"]:
+        """Return a floor of sigma that is `least` where that is higher, and below the initial value."""
+        return np.clip(least, floor, 0.99 * np.asarray(init))
 
     def init(self, sigma: Float[Numbers, " dy"], floor: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return rho for a standard deviation."""

@@ -16,7 +16,7 @@ from simpel_cli.blow_up import blown_up
 from simpel_cli.domain import Domain
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.gap import marginal_likelihood_scale
+from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
 from simpel_cli.transition import Transition, encoding_of, transition
@@ -179,7 +179,10 @@ def assemble(
         length = padded_length(len(x))
         targets = (y - normaliser.y_mean) / normaliser.y_std
         key_scale, key_bank = jax.random.split(key)
-        scale = _gap_scale(prior, bound, system, normaliser, x, targets, noise_init, key_scale)
+        scale, sigma = _scales(
+            prior, bound, system, normaliser, x, targets, noise_init, key_scale,
+            with_noise=noise.learn and noise.marginal_share > 0,
+        )  # fmt: skip
         arrays = Problem(
             x=pad_rows(x, length),
             y=pad_rows(targets, length),
@@ -187,7 +190,7 @@ def assemble(
             normaliser=normaliser,
             gap_scale=scale,
             noise_init=noise_init,
-            noise_floor=noise_floor,
+            noise_floor=noise.raised(noise_floor, noise.marginal_share * sigma, noise_init),
             bank=_bank(prior, system, pad_rows(x, length), pool, key_bank),
         )
         problems.append(arrays)
@@ -224,7 +227,7 @@ def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: 
     return Bank(points, np.moveaxis(system.simulate(key_phi, points, prior.draws), 0, -1))
 
 
-def _gap_scale(
+def _scales(
     prior: SimulatorPrior | GPPrior,
     bound: FunctionPrior,
     system: System,
@@ -233,32 +236,38 @@ def _gap_scale(
     targets: np.ndarray,
     noise_init: np.ndarray,
     key: PRNGKeyArray,
-) -> np.ndarray:
-    """Return kappa per target in normalised units, by the rule that the prior declares."""
+    *,
+    with_noise: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return kappa and sigma per target in normalised units, sigma 0 where it is not asked for.
+
+    kappa is what the prior declares; what it does not is chosen by marginal likelihood, as sigma is.
+    """
     gap: GapGP | None = prior.gap
-    zeros = np.zeros(system.encoding.dim_y)
-    if gap is None:
-        return zeros
-    if not isinstance(gap.scale, str):
-        return zeros + gap.scale
-    declared = zeros + np.nan
-    if gap.scale == "declared":
-        declared = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
-    if not np.isnan(declared).any():
-        return declared
+    size = system.encoding.dim_y
+    given = np.zeros(size)
+    if gap is not None:
+        given = given + (np.nan if isinstance(gap.scale, str) else gap.scale)
+        if gap.scale == "declared":
+            given = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
+    if not (np.isnan(given).any() or with_noise):
+        return given, np.zeros(size)
     subset: slice | np.ndarray = slice(None)
     if len(x) > SCALE_POINTS:  # the first ones may all be of one episode
         key, key_rows = jax.random.split(key)
         subset = np.asarray(jax.random.choice(key_rows, len(x), (SCALE_POINTS,), replace=False))
-    samples = (system.simulate(key, x[subset], SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
-    normalised = (x[subset] - normaliser.x_mean) / normaliser.x_std
-    correlation = np.asarray(
-        bound._replace(white_variance=0.0).covariance(jnp.asarray(normalised), jnp.ones(len(zeros)))[0]
-    )
+    here = x[subset]
+    samples = np.zeros((2, len(here), size))
+    if prior.uses_simulator:
+        samples = (system.simulate(key, here, SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
+    normalised = (here - normaliser.x_mean) / normaliser.x_std
+    correlation = np.asarray(bound._replace(white_variance=0.0).covariance(jnp.asarray(normalised), jnp.ones(size))[0])
     chosen = [
-        marginal_likelihood_scale(
-            samples[:, :, i], correlation, targets[subset, i], noise_init[i], prior.white_variance
+        marginal_likelihood_scales(
+            samples[:, :, i], correlation, targets[subset, i], noise_init[i], prior.white_variance,
+            None if np.isnan(given[i]) else float(given[i]),
         )
-        for i in range(len(zeros))
-    ]
-    return np.where(np.isnan(declared), np.array(chosen), declared)
+        for i in range(size)
+    ]  # fmt: skip
+    scale, sigma = (np.array(values) for values in zip(*chosen, strict=True))
+    return scale, sigma if with_noise else np.zeros(size)

@@ -6,7 +6,7 @@ import numpy as np
 import oracles
 import pytest
 
-from simpel_cli.gap import marginal_likelihood_scale
+from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.gp import Kernel, Matern32, Matern52, SquaredExponential, gram, posterior
 
 # Rasmussen and Williams (2006), eqs. 4.9 and 4.17, as functions of the distance r in lengthscales
@@ -74,7 +74,7 @@ def scales(kappa: float, seeds: int, m: int = 60, noise: float = 0.1) -> list[fl
         slopes = rng.normal(1, 0.3, 513)
         gap = kappa * np.linalg.cholesky(correlation + 1e-9 * np.eye(m)) @ rng.normal(size=m)
         y = slopes[0] * x + gap + noise * rng.normal(size=m)
-        chosen.append(marginal_likelihood_scale(slopes[1:, None] * x, correlation, y, 0.2, 1e-4))
+        chosen.append(marginal_likelihood_scales(slopes[1:, None] * x, correlation, y, 0.2, 1e-4).gap)
     return chosen
 
 
@@ -92,6 +92,22 @@ def test_marginal_likelihood_finds_no_gap_where_there_is_none() -> None:
     assert chosen.max() < 0.12  # of the order of the noise, 0.1, at the worst
 
 
+def test_marginal_likelihood_recovers_the_noise_beside_a_gap_that_is_known() -> None:
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        x = rng.uniform(-3, 3, 60)
+        correlation = oracles.squared_exponential(x, x, 1.0)
+        gap = 0.5 * np.linalg.cholesky(correlation + 1e-9 * np.eye(60)) @ rng.normal(size=60)
+        y = gap + 0.1 * rng.normal(size=60)
+        scales = marginal_likelihood_scales(np.zeros((2, 60)), correlation, y, 0.3, 1e-6, 0.5)
+        assert scales.gap == 0.5
+        found.append(np.log(scales.noise))
+    # 54 values that the gap cannot follow: standard error of log sigma 0.1 each
+    assert abs(np.mean(found) - np.log(0.1)) < 0.1
+    assert abs(np.array(found) - np.log(0.1)).max() < 0.4
+
+
 def test_where_data_are_few_the_scale_stays_with_its_prior() -> None:
-    one = marginal_likelihood_scale(np.zeros((8, 1)), np.eye(1), np.array([0.1]), 0.1, 1e-4)
+    one = marginal_likelihood_scales(np.zeros((8, 1)), np.eye(1), np.array([0.1]), 0.1, 1e-4).gap
     assert 0.03 < one < 0.3
