@@ -17,6 +17,7 @@ from simpel_cli.methods.exact_gp import ExactGP
 from simpel_cli.methods.fmap import FunctionMAP
 from simpel_cli.methods.fsvgd import FSVGD, stein_velocity
 from simpel_cli.methods.greybox import GreyBox
+from simpel_cli.methods.preconditioner import preconditioned
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
@@ -126,6 +127,38 @@ def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     mean, covariance = oracles.gp_posterior(k(X, X), k(GRID, X), k(GRID, GRID), y[:, 0] - np.asarray(at_data), NOISE)
     np.testing.assert_allclose(found.mean[:, 0], np.asarray(line_alone.mean[:, 0]) + mean, atol=1e-4)
     np.testing.assert_allclose(found.epistemic_std[:, 0], np.sqrt(np.diag(covariance)), rtol=2e-3, atol=2e-4)
+
+
+def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly() -> None:
+    random = np.random.default_rng(2)
+    samples, factor = random.normal(size=(6, 2, 50)), random.normal(size=(2, 6, 6))
+    known, evenly = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6), np.array([0.3, 2.0])
+    velocity = random.normal(size=(3, 6, 2))
+    found = preconditioned(*(jnp.asarray(a) for a in (velocity, samples, known, evenly)))
+    for i in range(2):
+        curvature = np.linalg.inv(np.cov(samples[:, i]) + known[i]) + np.eye(6) / evenly[i]
+        np.testing.assert_allclose(found[:, :, i], np.linalg.solve(curvature, velocity[:, :, i].T).T, rtol=1e-9)
+
+
+def test_newtons_direction_reaches_in_few_steps_the_posterior_of_a_line_that_is_nearly_right() -> None:
+    y = 1.3 * X - 0.4 + 0.05 * np.sin(3 * X) + NOISE * RANDOM.normal(size=X.shape)
+    prior, kappa = prior_of(gap=True), 0.05
+
+    def k(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        lines = 3.0 * a @ b.T + 0.25  # variances of U(-3, 3) and N(0, 1/2)
+        return lines + kappa**2 * oracles.squared_exponential(a[:, 0], b[:, 0], 1.0)
+
+    exact, _ = oracles.gp_posterior(k(X, X), k(GRID, X), k(GRID, GRID), y[:, 0], NOISE)
+
+    def off(precondition: bool) -> float:
+        method = FunctionMAP(
+            steps=600, particles=4, network=MLP((32, 32)), pool=64, weight_decay=0.0, noise=FIXED,
+            precondition=precondition,
+        )  # fmt: skip
+        return float(np.sqrt(np.mean((predicted(method, y, prior, kappa).mean[:, 0] - exact) ** 2)))
+
+    assert off(True) < 0.05
+    assert off(True) < off(False) / 3
 
 
 def test_exact_gp_finds_the_noise_by_marginal_likelihood() -> None:

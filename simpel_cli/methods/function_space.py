@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.networks import Networks, State
+from simpel_cli.methods.preconditioner import preconditioned
 from simpel_cli.nets import MLP
 
 LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
@@ -52,6 +53,8 @@ class FunctionSpace(ABC):
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
         prior_weight: exponent of the prior; 1 is Bayes.
+        precondition: go in Newton's direction of the function values (`preconditioner.py`): for rules whose particles climb
+            on their own, which else need many times the steps where data are few.
         noise: observation noise.
     """
 
@@ -61,10 +64,11 @@ class FunctionSpace(ABC):
     learning_rate: float = 3e-3
     final_learning_rate: float = 0.03
     weight_decay: float = 1e-3
-    batch: int = 8
-    fresh_points: int = 32
+    batch: int = 24
+    fresh_points: int = 16
     pool: int = 256
     prior_weight: float = 1.0
+    precondition: bool = False
     noise: NoiseModel = NoiseModel()
 
     uses_score = True  # not a field
@@ -135,6 +139,10 @@ class FunctionSpace(ABC):
             score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
             score = score.at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
+            if self.precondition:
+                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
+                covariance = setting.prior.covariance(x, problem.gap_scale)
+                velocity = preconditioned(velocity, draws.samples[rows], covariance, evenly)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)

@@ -41,7 +41,7 @@ class SVGD:
     network: MLP = MLP()
     learning_rate: float = 3e-3
     final_learning_rate: float = 0.03
-    batch: int = 8
+    batch: int = 24
     weight_std: float = 0.5
     bias_std: float = 1.0
     bandwidth: float | str = "median"

@@ -1,7 +1,7 @@
 """The published reference's own arrays (SIMPEL_SHARED/reference) as learning problems of this project.
 
 Simulators: pendulum_published; rc_car, the kinematic bicycle, with the action three steps old as its input, as the arrays
-have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 32 + 8 points, the reference's number of steps.
+have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 24 + 16 points, the reference's number of steps.
 """
 
 import os

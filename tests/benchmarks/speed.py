@@ -33,9 +33,9 @@ METHODS = {
     for method in ("simpel", "simpel_only_sim", "map", "repulsive", "fsvgd", "ensemble", "svgd", "greybox")
 }
 GROWTH = {
-    "L 20, 32 + 8 points, N 1028, m 20": {"name": PENDULUM},
+    "L 20, 24 + 16 points, N 1028, m 20": {"name": PENDULUM},
     **{f"N {n}": {"name": PENDULUM, "draws": n} for n in (128, 4112)},
-    **{f"{m} + 8 points": {"name": PENDULUM, "fields": {"fresh_points": m}} for m in (8, 128)},
+    **{f"24 + {m} points": {"name": PENDULUM, "fields": {"fresh_points": m}} for m in (8, 64)},
     **{f"L {n}": {"name": PENDULUM, "fields": {"particles": n}} for n in (5, 80)},
     **{f"m {m}": {"name": PENDULUM, "rows": m} for m in (320, 5120)},
 }
