@@ -5,9 +5,6 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-# tests compile much and run little: less optimisation of programs, here and in the processes that tests start
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
-
 import jax
 import pytest
 

@@ -171,6 +171,7 @@ def test_spikes_are_counted_and_leave_the_errors_at_the_noise(idle: tuple[dict[s
         assert 0.7 * std < found["noise_floor"][name] < 1.3 * std
 
 
+@pytest.mark.slow
 def test_neither_spikes_nor_a_computed_velocity_hide_an_effect(tmp_path: Path) -> None:
     rows, _ = spiked(table(friction=0.5), 3, share=0.01)
     for run in range(6):

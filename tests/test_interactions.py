@@ -123,6 +123,7 @@ def said(data: Recording, search: Search, assessor: Assessor, left: Selection) -
     return verdict_of(search, left, [], before, before, left_over, windows, data.checks, 10, 0.0)
 
 
+@pytest.mark.slow
 def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> None:
     data = lane(lambda s: 0.3 * s, 0.0, 0)
     search, assessor, _, left = looked(data, tmp_path)
@@ -134,6 +135,7 @@ def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> N
     assert found["remainder"]["log_evidence_gain"] > 20
 
 
+@pytest.mark.slow
 def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
     data = lane(lambda s: 0.5 * s**2, 0.0, 0)
     search, assessor, first, left = looked(data, tmp_path)

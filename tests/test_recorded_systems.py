@@ -62,7 +62,9 @@ def test_a_ball_falls_along_a_parabola() -> None:
     np.testing.assert_allclose(after, [40 - 3 * dt - 9.81 * dt**2 / 2, -3 - 9.81 * dt], rtol=1e-12)
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize(
+    "experiment", [pytest.param(e, marks=[pytest.mark.slow] if e == "rc_car" else []) for e in EXPERIMENTS]
+)
 def test_experiment_runs_on_its_recording(
     experiment: str, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

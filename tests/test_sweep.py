@@ -14,23 +14,18 @@ from command_line import FIT, PATIENCE, TINY, process, rows, simpel, start
 
 class TestSweep:
     def test_a_job_that_fails_costs_itself_only(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=0,1", "hydra.sweep.dir=sweep")
+        words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1", "hydra.sweep.dir=sweep")
         result = process(tmp_path, "sweep", *words)
         assert result.code == 2
-        assert "2 of 4 jobs failed, the others are collected" in result.err
+        assert "1 of 2 jobs failed, the others are collected" in result.err
         assert "method.learning_rate: got -1.0; it must be positive" in result.err
         table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {(row["run"], row["seed"]) for row in table} == {
-            ("method.learning_rate=0.001 run.seed=0", 0),
-            ("method.learning_rate=0.001 run.seed=1", 1),
-        }
-        assert {row["split"] for row in table} == {"test"}
-        status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(4)]
-        assert status == ["done", "done", "failed", "failed"]
+        assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
+        status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(2)]
+        assert status == ["done", "failed"]
         single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
         assert single.code == 0
-        of_sweep = [r["value"] for r in table if r["seed"] == 1]
-        assert of_sweep == [r["value"] for r in rows(tmp_path / "single", split="test")]
+        assert [r["value"] for r in table] == [r["value"] for r in rows(tmp_path / "single", split="test")]
 
     def test_a_worker_that_is_killed_costs_one_job(self, tmp_path: Path) -> None:
         """`fit -m` is the same as `sweep`."""
