@@ -47,8 +47,9 @@ format: install ## Format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: install ## Measure scores and speed on the reference's arrays (needs SIMPEL_SHARED)
+bench: install ## Measure scores of every method, and speed of every estimator, on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
+	$(BIN)/python -m tests.benchmarks.speed estimators
 
 sbc: install ## Calibrate the inference of an experiment on functions of its own prior (WORDS="experiment=pendulum method=fsvgd")
 	$(BIN)/python -m tests.benchmarks.sbc $(WORDS)

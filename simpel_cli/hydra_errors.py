@@ -101,7 +101,8 @@ def _interpolation(text: str, key: str) -> str:
     if found := re.search(r"Environment variable '(.+)' not found", text):
         return f"the environment variable {found[1]} is not set: set it, or give a default, ${{oc.env:{found[1]},DEFAULT}}."
     if found := re.search(r"Unsupported interpolation type (.+)", text):
-        return f"${{{found[1]}:...}} is unknown; allowed are ${{oc.env:NAME}}, ${{simpel_data:}} and ${{key}}."
+        known = "${oc.env:NAME}, ${simpel_data:}, ${simpel_shared:} and ${key}"
+        return f"${{{found[1]}:...}} is unknown; allowed are {known}."
     if found := re.search(r"ConfigError raised while resolving interpolation: (.+)", text):
         return found[1]
     if "Missing mandatory value" in text:

@@ -281,7 +281,7 @@ def test_svgd_moves_weights_along_steins_velocity_of_the_log_posterior() -> None
 def test_a_prior_without_a_simulator_is_centred_on_the_mean_of_the_normaliser() -> None:
     problem = problem_of(X)
     problem = problem._replace(normaliser=problem.normaliser._replace(y_mean=jnp.full(1, 5.0), y_std=jnp.full(1, 2.0)))
-    method = FSVGD(particles=2, network=MLP((4,)), pool=16, fresh_points=8)
+    method = FSVGD(particles=2, network=MLP((4,)), batch=8, pool=16, fresh_points=8)
     without = GPPrior().bind(None, 1, 1, np.ones(1))
     draws = method.bind(setting_of(without), problem).draw(jax.random.key(0))
     np.testing.assert_array_equal(draws.samples, 0.0)
@@ -341,6 +341,8 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
         (lambda: SVGD(bandwidth="wide"), "method.bandwidth"), (lambda: Repulsive(bandwidth=-1.0), "method.bandwidth"),
         (lambda: ExactGP(particles=1), "method.particles"), (lambda: FunctionMAP(learning_rate=0.0), "method.learning_rate"),
         (lambda: dataclasses.replace(FSVGD(), bandwidth=0.0), "method.bandwidth"),
+        (lambda: FSVGD(pool=32), r"batch \+ fresh_points \(40\)"),
+        (lambda: Repulsive(precondition=True, prior_weight=0.0), "prior_weight"),
     ],
 )  # fmt: skip
 def test_wrong_settings_are_named(make: Any, words: str) -> None:

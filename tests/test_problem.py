@@ -196,27 +196,44 @@ def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
     assert chosen(slice(None), KEY) != chosen(slice(None), jax.random.key(1))
 
 
-@pytest.mark.parametrize("prior", [SimulatorPrior(GapGP(scale=0.0)), SimulatorPrior(gap=None)], ids=["gap", "no gap"])
-def test_no_network_learns_less_noise_than_the_prior_leaves(prior):
+NOISY = 0.05  # normalised
+
+
+@pytest.mark.parametrize(
+    ("prior", "gap"),
+    [
+        (SimulatorPrior(GapGP(scale=0.5, lengthscale=1.0)), 0.5),
+        (SimulatorPrior(gap=None), 0.0),
+        (GPPrior(lengthscale=2.0), 0.0),
+    ],
+    ids=["gap", "no gap", "gp"],
+)
+def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
     system = system_of(declared(), (), 0)
     normaliser = normaliser_of(system, KEY)
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (100, 1)), rng.uniform(-2, 2, (100, 1))
-    true = 0.05 * normaliser.y_std
+    states, inputs = rng.uniform(-1, 1, (120, 1)), rng.uniform(-2, 2, (120, 1))
     x = system.encoding.to_x(states, inputs)
-    y = exact(states, inputs, np.ones((100, 1))) - states + true * rng.normal(size=(100, 1))
+    wave = gap * np.sin(2 * states) + NOISY * rng.normal(size=(120, 1))
+    y = exact(states, inputs, np.ones((120, 1))) - states + wave * normaliser.y_std
 
-    def floor(**fields):
+    def floor(rows=120, **fields):
         done = assemble(
-            system, normaliser, prior, Gaussian(), [(x, y)], {}, {},
+            system, normaliser, prior, Gaussian(), [(x[:rows], y[:rows])], {}, {},
             noise=NoiseModel(**fields), pool=16, keys=[KEY], precision="float32",
         )  # fmt: skip
         return float(done.problems.noise_floor[0, 0])
 
-    assert floor() == pytest.approx(0.05, rel=0.25)  # 100 values: 7 % standard error
+    assert floor() == pytest.approx(NOISY, rel=0.25)  # 120 values: 6 % standard error
     assert floor(marginal_share=0.5) == pytest.approx(floor() / 2, rel=1e-5)
     assert floor(marginal_share=0.0) == floor(learn=False) == pytest.approx(1e-3)
     assert floor(least_init=0.01) < 0.01  # never above the initial value
+    many = np.tile(x, (2, 1)), np.tile(y, (2, 1))
+    done = assemble(
+        system, normaliser, prior, Gaussian(), [many], {}, {},
+        noise=NoiseModel(), pool=16, keys=[KEY], precision="float32",
+    )  # fmt: skip
+    assert float(done.problems.noise_floor[0, 0]) == pytest.approx(1e-3)  # so many rows teach the noise themselves
 
 
 def test_learned_noise_starts_at_and_stays_above_what_was_measured():

@@ -77,10 +77,13 @@ class FunctionSpace(ABC):
         for name in ("steps", "particles", "batch", "fresh_points", "pool"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
-        if self.pool & (self.pool - 1) or self.pool < self.fresh_points:
+        points = self.batch + self.fresh_points  # fresh ones fill the batch where data are fewer
+        if self.pool & (self.pool - 1) or self.pool < points:
             raise ConfigError(
-                f"method.pool: got {self.pool}; it must be a power of two and at least fresh_points ({self.fresh_points})."
+                f"method.pool: got {self.pool}; it must be a power of two and at least batch + fresh_points ({points})."
             )
+        if self.precondition and not self.prior_weight > 0:
+            raise ConfigError(f"method.precondition: it needs a prior, and method.prior_weight is {self.prior_weight}.")
         if not self.learning_rate > 0:
             raise ConfigError(f"method.learning_rate: got {self.learning_rate}; it must be positive.")
 
@@ -141,8 +144,8 @@ class FunctionSpace(ABC):
             velocity, mean_kernel = self.velocity(h, score)
             if self.precondition:
                 evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
-                covariance = setting.prior.covariance(x, problem.gap_scale)
-                velocity = preconditioned(velocity, draws.samples[rows], covariance, evenly)
+                known = setting.prior.covariance(x, problem.gap_scale)
+                velocity = preconditioned(velocity, draws.samples[rows], known, evenly, self.prior_weight)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)

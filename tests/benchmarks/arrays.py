@@ -4,7 +4,6 @@ Simulators: pendulum_published; rc_car, the kinematic bicycle, with the action t
 have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 24 + 16 points, the reference's number of steps.
 """
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import numpy as np
 import yaml
 from jaxtyping import Array, Key
 
-from simpel_cli.config import conf_dir
+from simpel_cli.config import conf_dir, recordings_dir
 from simpel_cli.inference import Method, Normaliser
 from simpel_cli.nodes import build
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
@@ -59,7 +58,7 @@ class Case(NamedTuple):
 
 def folder() -> Path:
     """Return where the arrays lie."""
-    return Path(os.environ.get("SIMPEL_SHARED", "../shared")) / "reference"
+    return recordings_dir() / "reference"
 
 
 def sets() -> list[str]:

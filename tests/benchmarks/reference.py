@@ -54,7 +54,7 @@ def scored(given: Case) -> dict[str, Any]:
     kappa = given.assembled.gap_scale
     return found | {
         "seconds": time.perf_counter() - began,
-        "kappa": None if kappa is None else kappa.tolist(),
+        "kappa": [] if kappa is None else kappa.tolist(),
         "noise_std": noise.tolist(),
     }
 
@@ -84,7 +84,7 @@ def main() -> None:
         + "|---" * 8
         + "|"
     )
-    table: dict[str, list[Any]] = {k: [] for k in ("set", "method", "score", "seed", *KEYS)}
+    table: dict[str, list[Any]] = {k: [] for k in ("set", "method", "score", "seed", *KEYS, "kappa", "noise_std")}
     for name in options.sets:
         for method in options.methods:
             given = case(name, method, options.score, seeds=options.seeds, scale=options.gap_scale, fields=fields)
@@ -95,6 +95,7 @@ def main() -> None:
             print(f"| {name} | {method} | {cells} | {found['seconds']:.0f} | {theirs} |", flush=True)
             for seed in range(options.seeds):
                 row = {"set": name, "method": method, "score": options.score, "seed": seed}
+                row |= {"kappa": found["kappa"], "noise_std": found["noise_std"]}  # of the first seed, mean of seeds
                 for key, value in (row | {k: found[k][seed] for k in KEYS}).items():
                     table[key].append(value)
             if options.out:  # what is there, should the rest not come

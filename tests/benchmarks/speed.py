@@ -87,9 +87,11 @@ def measured(given: dict[str, Any], stretches: int, started: float) -> dict[str,
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     per_step = float(np.median(np.diff(laps)[1:])) / STRETCH * 1e3
     rule = prepared.rule
-    size = prepared.assembled.setting.prior.dim_y
-    rows = min(rule.batch, prepared.assembled.problems.x.shape[1]) + getattr(rule, "fresh_points", 0)
-    best = limit(rule.particles, rows, [prepared.assembled.problems.x.shape[2], *rule.network.hidden, size])
+    trained = getattr(rule, "residual", rule)  # GreyBox trains those of its residual
+    shape = prepared.assembled.problems.x.shape
+    points = min(trained.batch, shape[1]) + getattr(trained, "fresh_points", 0)
+    sizes = [shape[2], *trained.network.hidden, prepared.assembled.setting.prior.dim_y]
+    best = limit(trained.particles, points, sizes)
     return {
         "ms_per_step": per_step,
         "share_of_limit": best / per_step,
