@@ -31,7 +31,7 @@ demo: install ## Run the main job (simpel fit experiment=pendulum) and say where
 	$(BIN)/simpel fit experiment=pendulum
 
 test: install ## Run the tests (under 12 minutes on two cores)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 test-slow: install ## Run the long studies that `make test` leaves out
 	$(BIN)/python -m pytest -m slow

@@ -9,6 +9,10 @@ import jax
 import pytest
 
 ROOT = Path(__file__).parents[1]
+LONGEST = (
+    "wrong_inputs", "cli", "discover", "resume", "discovery_filter", "methods", "own_data", "recorded_systems", "scores",
+    "discover_hopeless", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
+)  # fmt: skip
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs
 
 # tests send Ctrl-C to processes that they start; a shell's background job ignores it, and would hand that on
@@ -21,6 +25,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "xla"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, so that the workers of `make test` end together."""
+    rank = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
 @pytest.fixture(scope="module", autouse=True)
