@@ -146,7 +146,8 @@ CASES = [
     case("hostile override", ("fit", "sim.dynamics.omega=\"__import__('os').system('touch pwned')\""), CONFIG,
          "sim.dynamics.omega", "not allowed"),
     # measurements
-    own("no file", DATA, "data.path: ", "my/run.csv' was not found", measurements=b"absent"),
+    own("no file", DATA, "data.path: '../run.csv' was not found. Tried: ", "my/run.csv", measurements=b"absent"),
+    case("no file in the working directory", "fit data.path=nowhere.csv", DATA, "/conf/data/nowhere.csv, ", "/nowhere.csv."),
     own("no such column", DATA, "column 'velocity' is missing in run.csv (it has: run, t, pos, vel, volts)",
         "`columns: {v: null}`", data=RIG.replace("vel", "velocity")),
     own("unknown quantity", CONFIG, "data.columns.w: the simulator has no such quantity (it has: s, v, u)",

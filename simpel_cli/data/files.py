@@ -25,7 +25,7 @@ def locate(path: str, base: Path) -> Path:
         if candidate.is_file():
             return candidate.resolve()
     folder = " It is a folder, not a file." if any(c.is_dir() for c in tried) else ""
-    places = ", ".join(dict.fromkeys(str(c) for c in tried))
+    places = ", ".join(dict.fromkeys(str(c.resolve()) for c in tried))
     raise DataError(f"data.path: '{path}' was not found.{folder} Tried: {places}.")
 
 
@@ -40,8 +40,7 @@ def absolute(data: Mapping[str, Any], base: Path) -> dict[str, Any]:
     def found(path: Any) -> Any:
         if not isinstance(path, str):
             return path
-        tried = _places(path, base)
-        return str(next((p for p in tried if p.is_file()), tried[0]).resolve())
+        return next((str(p.resolve()) for p in _places(path, base) if p.is_file()), path)
 
     def all_found(paths: Any) -> Any:
         return [found(path) for path in paths] if isinstance(paths, list | tuple) else found(paths)
