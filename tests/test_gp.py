@@ -108,6 +108,14 @@ def test_marginal_likelihood_recovers_the_noise_beside_a_gap_that_is_known() -> 
     assert abs(np.array(found) - np.log(0.1)).max() < 0.4
 
 
+def test_what_a_gap_that_is_known_to_be_none_leaves_is_noise() -> None:
+    x = np.linspace(-3, 3, 60)
+    wave = 0.3 * np.sin(x)
+    scales = marginal_likelihood_scales(np.zeros((2, 60)), oracles.squared_exponential(x, x, 1.0), wave, 0.3, 1e-6, 0.0)
+    assert scales.gap == 0.0
+    assert scales.noise == pytest.approx(wave.std(), rel=0.05)
+
+
 def test_where_data_are_few_the_scale_stays_with_its_prior() -> None:
     one = marginal_likelihood_scales(np.zeros((8, 1)), np.eye(1), np.array([0.1]), 0.1, 1e-4).gap
     assert 0.03 < one < 0.3

@@ -129,14 +129,15 @@ def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     np.testing.assert_allclose(found.epistemic_std[:, 0], np.sqrt(np.diag(covariance)), rtol=2e-3, atol=2e-4)
 
 
-def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly() -> None:
+@pytest.mark.parametrize("weight", [1.0, 0.3])
+def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly(weight: float) -> None:
     random = np.random.default_rng(2)
     samples, factor = random.normal(size=(6, 2, 50)), random.normal(size=(2, 6, 6))
     known, evenly = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6), np.array([0.3, 2.0])
     velocity = random.normal(size=(3, 6, 2))
-    found = preconditioned(*(jnp.asarray(a) for a in (velocity, samples, known, evenly)))
+    found = preconditioned(*(jnp.asarray(a) for a in (velocity, samples, known, evenly)), weight)
     for i in range(2):
-        curvature = np.linalg.inv(np.cov(samples[:, i]) + known[i]) + np.eye(6) / evenly[i]
+        curvature = weight * np.linalg.inv(np.cov(samples[:, i]) + known[i]) + np.eye(6) / evenly[i]
         np.testing.assert_allclose(found[:, :, i], np.linalg.solve(curvature, velocity[:, :, i].T).T, rtol=1e-9)
 
 
