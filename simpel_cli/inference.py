@@ -100,14 +100,7 @@ class ScoreEstimator(Protocol):
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
     ) -> Float[Array, "L M"]:
-        """Return the scores at L function values.
-
-        Args:
-            h: function values.
-            samples: draws of the simulator's part of the prior.
-            covariance: of the Gaussian part, which is independent of it.
-            gap: draws of the Gaussian part, where they are needed; None: it is 0.
-        """
+        """Return the scores at L function values; see `simpel_cli.scores.estimator.Estimator`, which also is fitted first."""
         ...
 
 

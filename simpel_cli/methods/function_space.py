@@ -6,7 +6,8 @@ function values h_l in R^(k dy) and scores into velocities of function values,
     s_l = grad_{h_l} { (m/b) sum_batch log N(y; h_l(x), sigma^2) + log p(h_l^X) },
 
 and the weights follow by the vector-Jacobian product. The score is that of the joint log posterior: the same prior weighs
-the same under every estimator and rule.
+the same under every estimator and rule. No function value has a part in what an estimator makes of the prior on X: a stretch of
+steps chooses among a number of sets, and the estimators are fitted once to each.
 
 Reference: Wang, Ren, Zhu and Zhang (2019), Function space particle optimization for Bayesian neural networks, eq. 5; Treven et
 al., Simulation priors (SimPEL).
@@ -26,15 +27,28 @@ from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.networks import Networks, State
 from simpel_cli.methods.preconditioner import preconditioned
 from simpel_cli.nets import MLP
+from simpel_cli.scores.estimator import Score, fitted
+from simpel_cli.scores.gaussian import moments
 
 LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
 
 
-class Draws(NamedTuple):
-    """Points of the domain and prior draws at them and at the training inputs, shared by a stretch of steps."""
+class Sets(NamedTuple):
+    """Measurement sets that a stretch of steps chooses from; the leaves of one have no S.
 
-    x: Float[Array, "B dx"]
-    samples: Float[Array, "B dy N"]
+    Args:
+        x: normalised points, the batch first.
+        batch: training rows of the batch.
+        is_data: which of them count.
+        score: of the prior, fitted per output; leaves (S, dy, ...).
+        covariance: of the prior, float64; None where it is not needed.
+    """
+
+    x: Float[Array, "*S k dx"]
+    batch: Int[Array, "*S b"]
+    is_data: Bool[Array, "*S b"]
+    score: Score
+    covariance: Float[Array, "*S dy k k"] | None
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,7 @@ class FunctionSpace(ABC):
         batch: training points per step, at most; drawn without replacement.
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
+        sets: measurement sets that a stretch of steps chooses from.
         prior_weight: exponent of the prior; 1 is Bayes.
         precondition: go in Newton's direction of the function values (`preconditioner.py`): for rules whose particles climb
             on their own, which else need many times the steps where data are few.
@@ -67,6 +82,7 @@ class FunctionSpace(ABC):
     batch: int = 24
     fresh_points: int = 16
     pool: int = 256
+    sets: int = 64
     prior_weight: float = 1.0
     precondition: bool = False
     noise: NoiseModel = NoiseModel()
@@ -74,7 +90,7 @@ class FunctionSpace(ABC):
     uses_score = True  # not a field
 
     def __post_init__(self) -> None:
-        for name in ("steps", "particles", "batch", "fresh_points", "pool"):
+        for name in ("steps", "particles", "batch", "fresh_points", "pool", "sets"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
         points = self.batch + self.fresh_points  # fresh ones fill the batch where data are fewer
@@ -103,7 +119,19 @@ class FunctionSpace(ABC):
 
         networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
-        def draw(key: PRNGKeyArray) -> Draws:
+        def draw(key: PRNGKeyArray) -> Sets:
+            key_bank, key_sets = jax.random.split(key)
+            x, samples = bank(key_bank)
+
+            def one(key: PRNGKeyArray) -> Sets:
+                key_points, key_gap = jax.random.split(key)
+                batch, is_data, rows = measurement_set(key_points)
+                return Sets(x[rows], batch, is_data, *of_prior(key_gap, x[rows], samples[rows]))
+
+            return jax.lax.map(one, jax.random.split(key_sets, self.sets))
+
+        def bank(key: PRNGKeyArray) -> tuple[Float[Array, "B dx"], Float[Array, "B dy N"]]:
+            """Training inputs, points of the domain and prior draws at them, normalised."""
             if problem.bank is not None:
                 x, samples = jnp.asarray(problem.bank.x), jnp.asarray(problem.bank.samples)
             else:
@@ -112,9 +140,9 @@ class FunctionSpace(ABC):
                 x = jnp.concatenate([jnp.asarray(problem.x), fresh])
                 samples = jnp.moveaxis(setting.prior.simulate(key_phi, x, setting.prior.draws), 0, -1)
                 if not setting.prior.simulates:
-                    return Draws(to_normalised.x(x), samples)
+                    return to_normalised.x(x), samples
             scaled = (samples - to_normalised.y_mean[None, :, None]) / to_normalised.y_std[None, :, None]
-            return Draws(to_normalised.x(x), scaled)
+            return to_normalised.x(x), scaled
 
         def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Bool[Array, " b"], Int[Array, " k"]]:
             """Rows of the batch, which of them are data, and rows of the bank: the batch and distinct fresh points."""
@@ -128,46 +156,45 @@ class FunctionSpace(ABC):
             # fresh points fill the batch where there are fewer data than it has room for
             return batch, is_data, fresh.at[:b].set(jnp.where(is_data, batch, fresh[:b]))
 
-        def step(key: PRNGKeyArray, state: State, draws: Draws) -> tuple[State, Info]:
-            key_points, key_gap = jax.random.split(key)
-            batch, is_data, rows = measurement_set(key_points)
-            b, counted = batch.shape[0], is_data.astype(dtype)
-            x, y = draws.x[rows], problem.y[batch]
-            h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
-
-            weight = problem.m.astype(dtype) / jnp.sum(counted)
-            fit, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
-            )(h[:, :b], state.noise)
-            score = self.prior_weight * prior_score(key_gap, h, draws.samples[rows], x)
-            score = score.at[:, :b].add(weight * score_data)
-            velocity, mean_kernel = self.velocity(h, score)
-            if self.precondition:
-                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
-                known = setting.prior.covariance(x, problem.gap_scale)
-                velocity = preconditioned(velocity, draws.samples[rows], known, evenly, self.prior_weight)
-
-            (ascent,) = pull_back(velocity)
-            after = networks.ascended(state, ascent, weight * score_noise)
-            info = Info(-fit / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
-            return after, info
-
-        def prior_score(
-            key: PRNGKeyArray, h: Float[Array, "L k dy"], samples: Float[Array, "k dy N"], x: Float[Array, "k dx"]
-        ) -> Float[Array, "L k dy"]:
+        def of_prior(
+            key: PRNGKeyArray, x: Float[Array, "k dx"], samples: Float[Array, "k dy N"]
+        ) -> tuple[Score, Float[Array, "dy k k"] | None]:
+            """Score and covariance of the prior on a set, per output."""
             covariance = setting.prior.covariance(x, problem.gap_scale)
             gap = None
             if setting.score.gap_draws:
                 # a prior without a simulator brings two draws, both zero: enough for moments, not for an estimate
                 samples = jnp.tile(samples, (1, 1, -(-LEAST_DRAWS // samples.shape[2])))
                 factor = jnp.linalg.cholesky(covariance.astype(jnp.float64)).astype(dtype)
-                gap = jnp.einsum("dkj,jdn->kdn", factor, jax.random.normal(key, samples.shape, dtype))
+                gap = jnp.einsum("dkj,jdn->dnk", factor, jax.random.normal(key, samples.shape, dtype))
+            by_output = jnp.transpose(samples, (1, 2, 0))
+            score = jax.vmap(lambda s, c, g: fitted(setting.score, s, c, g))(by_output, covariance, gap)
+            if not self.precondition:
+                return score, None
+            return score, jax.vmap(lambda s: moments(s)[1])(by_output) + covariance.astype(jnp.float64)
 
-            def estimate(h: Array, s: Array, c: Array, g: Array | None) -> Array:
-                return setting.score(h, s.T, c, None if g is None else g.T)
+        def step(key: PRNGKeyArray, state: State, sets: Sets) -> tuple[State, Info]:
+            chosen = jax.random.randint(key, (), 0, self.sets)
+            x, batch, is_data, of_output, covariance = jax.tree.map(lambda a: a[chosen], sets)
+            b, counted = batch.shape[0], is_data.astype(dtype)
+            y = problem.y[batch]
+            h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
 
-            every = jax.vmap(estimate, in_axes=(2, 1, 0, None if gap is None else 1), out_axes=2)
-            return every(h, samples, covariance, gap)
+            weight = problem.m.astype(dtype) / jnp.sum(counted)
+            fit, (score_data, score_noise) = jax.value_and_grad(
+                lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
+            )(h[:, :b], state.noise)
+            prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(of_output, h)
+            score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
+            velocity, mean_kernel = self.velocity(h, score)
+            if covariance is not None:
+                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
+                velocity = preconditioned(velocity, covariance, evenly, self.prior_weight)
+
+            (ascent,) = pull_back(velocity)
+            after = networks.ascended(state, ascent, weight * score_noise)
+            info = Info(-fit / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            return after, info
 
         return Inference(networks.init, draw, step, networks.predict, networks.members)
 

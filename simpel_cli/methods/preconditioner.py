@@ -16,12 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.scores.gaussian import moments
-
 
 def preconditioned(
     velocity: Float[Array, "L k dy"],
-    samples: Float[Array, "k dy N"],
     covariance: Float[Array, "dy k k"],
     evenly: Float[Array, " dy"],
     weight: float = 1.0,
@@ -30,19 +27,15 @@ def preconditioned(
 
     Args:
         velocity: of L particles.
-        samples: draws of the simulator at the measurement set.
-        covariance: of the Gaussian part of the prior.
+        covariance: C of every output, float64.
         evenly: c, variance of the data as if there were one at every point.
         weight: w, positive.
     """
 
-    def of_output(
-        v: Float[Array, "L k"], s: Float[Array, "k N"], known: Float[Array, "k k"], c: Float[Array, ""]
-    ) -> Float[Array, "L k"]:
-        prior = (moments(s.T)[1] + known.astype(jnp.float64)) / weight
-        c = c.astype(jnp.float64)
+    def of_output(v: Float[Array, "L k"], prior: Float[Array, "k k"], c: Float[Array, ""]) -> Float[Array, "L k"]:
+        prior, c = prior / weight, c.astype(prior.dtype)
         factor = jnp.linalg.cholesky(prior + c * jnp.eye(prior.shape[0]))
-        solved = jax.scipy.linalg.cho_solve((factor, True), v.T.astype(jnp.float64))
+        solved = jax.scipy.linalg.cho_solve((factor, True), v.T.astype(prior.dtype))
         return (c * (prior @ solved)).T.astype(v.dtype)
 
-    return jax.vmap(of_output, in_axes=(2, 1, 0, 0), out_axes=2)(velocity, samples, covariance, evenly)
+    return jax.vmap(of_output, in_axes=(2, 0, 0), out_axes=2)(velocity, covariance, evenly)

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.scores.estimator import Estimator, Score
 
 
 @dataclass(frozen=True)
-class Gaussian:
+class Gaussian(Estimator):
     """Moment-matched Gaussian score.
 
     Args:
@@ -28,30 +29,31 @@ class Gaussian:
 
     shrinkage: str = "none"
 
-    gap_draws = False  # not a field: the gap's covariance enters, draws of it are not needed
-
     def __post_init__(self) -> None:
         if self.shrinkage not in ("none", "ledoit_wolf"):
             raise ConfigError(f"score.shrinkage: got {self.shrinkage!r}; allowed are none and ledoit_wolf.")
 
-    def __call__(
+    def fitted(
         self,
-        h: Float[Array, "L M"],
         samples: Float[Array, "N M"],
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
-    ) -> Float[Array, "L M"]:
-        """Return the score of the joint log density of one output at M points; see `ScoreEstimator`.
+    ) -> Score:
+        """Return the score; see `Estimator`.
 
-        The factorisation runs in float64: the draws of a parametric simulator span few directions, so Sigma is close to
+        The inverse is taken in float64: the draws of a parametric simulator span few directions, so Sigma is close to
         singular.
         """
         mean, sampled = moments(samples)
         if self.shrinkage == "ledoit_wolf":
             sampled = _ledoit_wolf((samples - mean[None]).astype(jnp.float64), sampled)
         factor = jnp.linalg.cholesky(sampled + covariance.astype(jnp.float64))
-        residual = (h - mean[None]).astype(jnp.float64)
-        return -jax.scipy.linalg.cho_solve((factor, True), residual.T).T.astype(h.dtype)
+        precision = jax.scipy.linalg.cho_solve((factor, True), jnp.eye(len(mean), dtype=factor.dtype))
+        return jax.tree_util.Partial(_linear, mean, precision)
+
+
+def _linear(mean: Float[Array, " M"], precision: Float[Array, "M M"], h: Float[Array, "L M"]) -> Float[Array, "L M"]:
+    return -((h - mean[None]).astype(precision.dtype) @ precision).astype(h.dtype)
 
 
 def moments(samples: Float[Array, "N M"]) -> tuple[Float[Array, " M"], Float[Array, "M M"]]:

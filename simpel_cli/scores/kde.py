@@ -20,12 +20,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.scores.estimator import Estimator, Score
 from simpel_cli.scores.gaussian import moments
 from simpel_cli.scores.radial import squared_distances
 
 
 @dataclass(frozen=True)
-class KDE:
+class KDE(Estimator):
     """Kernel density estimate.
 
     Args:
@@ -36,8 +37,6 @@ class KDE:
 
     bandwidth: float | str = "gradient"
 
-    gap_draws = False
-
     def __post_init__(self) -> None:
         if isinstance(self.bandwidth, str):
             if self.bandwidth not in ("gradient", "scott"):
@@ -47,25 +46,20 @@ class KDE:
         elif not 0 < self.bandwidth <= 1:
             raise ConfigError(f"score.bandwidth: got {self.bandwidth}; of kde it must be above 0 and at most 1.")
 
-    def __call__(
+    def fitted(
         self,
-        h: Float[Array, "L M"],
         samples: Float[Array, "N M"],
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
-    ) -> Float[Array, "L M"]:
-        """Return the score of the joint log density of one output at M points; see `ScoreEstimator`."""
+    ) -> Score:
+        """Return the score; see `Estimator`."""
         mean, spread = moments(samples)
         known = covariance.astype(spread.dtype)
         b2 = self._squared(samples.shape[0], spread, known)
         factor = jnp.linalg.cholesky(b2 * spread + known)
+        to_white = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(mean), dtype=factor.dtype), lower=True)
         shrunk = jnp.sqrt(1 - b2) * (samples - mean[None]).astype(spread.dtype)
-        here = (h - mean[None]).astype(spread.dtype)
-        white = jax.scipy.linalg.solve_triangular(factor, jnp.concatenate([shrunk, here]).T, lower=True).T
-        n = samples.shape[0]
-        weight = jax.nn.softmax(-squared_distances(white[n:], white[:n]) / 2, axis=1)
-        pull = weight @ white[:n] - white[n:]
-        return jax.scipy.linalg.solve_triangular(factor, pull.T, lower=True, trans=1).T.astype(h.dtype)
+        return jax.tree_util.Partial(_pull, mean, to_white, shrunk @ to_white.T)
 
     def _squared(self, n: int, spread: Float[Array, "M M"], known: Float[Array, "M M"]) -> Float[Array, ""]:
         if not isinstance(self.bandwidth, str):
@@ -77,3 +71,12 @@ class KDE:
         if self.bandwidth == "scott":
             return n ** (-2 / (d + 4))
         return (4 / (n * (d + 4))) ** (2 / (d + 6))
+
+
+def _pull(
+    mean: Float[Array, " M"], to_white: Float[Array, "M M"], centres: Float[Array, "N M"], h: Float[Array, "L M"]
+) -> Float[Array, "L M"]:
+    """Return where the mixture of white Gaussians about the centres is denser."""
+    here = (h - mean[None]).astype(to_white.dtype) @ to_white.T
+    weight = jax.nn.softmax(-squared_distances(here, centres) / 2, axis=1)
+    return ((weight @ centres - here) @ to_white).astype(h.dtype)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.scores import radial
+from simpel_cli.scores.estimator import Estimator, Score
 from simpel_cli.scores.gaussian import Gaussian
 
 MOST_CONJUGATE = 2000  # steps of the linear solve of Tikhonov's variant
@@ -45,7 +46,7 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NuMethod:
+class NuMethod(Estimator):
     """Curl-free score estimator.
 
     Args:
@@ -80,28 +81,37 @@ class NuMethod:
         if self.centres < 2:
             raise ConfigError(f"score.centres: got {self.centres}; it must be at least 2.")
 
-    def __call__(
+    def fitted(
         self,
-        h: Float[Array, "L M"],
         samples: Float[Array, "N M"],
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
-    ) -> Float[Array, "L M"]:
-        """Return the score of the joint log density of one output at M points; see `ScoreEstimator`."""
+    ) -> Score:
+        """Return the score; see `Estimator`."""
         draws = (samples if gap is None else samples + gap)[: self.centres]
         n, middle = draws.shape[0], jnp.mean(draws, axis=0)[None]
         s = radial.width(self.bandwidth, self.wider, draws - middle)
-        x, z = (draws - middle) / s, (h - middle) / s
-        base = jnp.zeros((n + h.shape[0], h.shape[1]), h.dtype)
-        if self.baseline == "gaussian":
-            base = s * Gaussian()(jnp.concatenate([draws, h]), samples, covariance)
-        among, here = field(self.kernel, x, x), field(self.kernel, z, x)
+        x = (draws - middle) / s
+        start = Gaussian().fitted(samples, covariance) if self.baseline == "gaussian" else None
+        base = jnp.zeros_like(x) if start is None else s * start(draws)
+        among = field(self.kernel, x, x)
         zeta = among.divergence() / n
-        if self.regularisation == "nu":
-            a, c = self._descend(among, zeta, base[:n])
-        else:
-            a, c = self._tikhonov(among, zeta, base[:n])
-        return (base[n:] + a * here.divergence() / n + here.apply(c)) / s
+        a, c = (self._descend if self.regularisation == "nu" else self._tikhonov)(among, zeta, base)
+        return jax.tree_util.Partial(self._at, middle, s, x, a, c, start)
+
+    def _at(
+        self,
+        middle: Float[Array, "1 M"],
+        s: Float[Array, ""],
+        x: Float[Array, "N M"],
+        a: Float[Array, ""],
+        c: Float[Array, "N M"],
+        start: Score | None,
+        h: Float[Array, "L M"],
+    ) -> Float[Array, "L M"]:
+        here = field(self.kernel, (h - middle) / s, x)
+        found = (a * here.divergence() / x.shape[0] + here.apply(c)) / s
+        return found if start is None else start(h) + found
 
     def _descend(self, among: Field, zeta: Array, base: Array) -> tuple[Array, Array]:
         """Return (a, c) of d = a zeta + sum_n Gamma(., x_n) c_n after the steps of the nu-method."""

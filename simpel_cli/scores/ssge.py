@@ -17,11 +17,12 @@ from jaxtyping import Array, Float
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.scores import radial
+from simpel_cli.scores.estimator import Estimator, Score
 from simpel_cli.scores.gaussian import Gaussian
 
 
 @dataclass(frozen=True)
-class SSGE:
+class SSGE(Estimator):
     """Spectral estimator.
 
     Args:
@@ -54,27 +55,26 @@ class SSGE:
         if not self.eta >= 0:
             raise ConfigError(f"score.eta: got {self.eta}; it must be at least 0.")
 
-    def __call__(
+    def fitted(
         self,
-        h: Float[Array, "L M"],
         samples: Float[Array, "N M"],
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
-    ) -> Float[Array, "L M"]:
-        """Return the score of the joint log density of one output at M points; see `ScoreEstimator`."""
+    ) -> Score:
+        """Return the score; see `Estimator`."""
         draws = samples if gap is None else samples + gap
         n = draws.shape[0]
         landmarks = min(self.landmarks, n)
         middle = jnp.mean(draws, axis=0)[None]
         s = radial.width(self.bandwidth, 1.0, draws - middle)
-        x, z = (draws - middle) / s, (h - middle) / s
+        x = (draws - middle) / s
         nodes = x[:landmarks]
         gram = radial.profile(self.kernel, radial.squared_distances(nodes, nodes)).f
         values, vectors = radial.subspace(gram, min(self.rank, landmarks), jax.random.key(0))
-        values = jnp.maximum(values, jnp.finfo(h.dtype).eps * landmarks)
+        values = jnp.maximum(values, jnp.finfo(values.dtype).eps * landmarks)
         # the trace of the kernel matrix is the number of landmarks
         before = jnp.cumsum(values) - values
-        kept = (before < self.share * landmarks).astype(h.dtype)
+        kept = (before < self.share * landmarks).astype(values.dtype)
         scale = kept * landmarks**0.5 / (values + self.eta * landmarks)
         modes = vectors * scale[None]  # psi_j(x) = k(x, nodes) modes_j
 
@@ -83,10 +83,21 @@ class SSGE:
         # sum over draws of the gradient of k(x, node)
         gradient = slope.T @ x - jnp.sum(slope, axis=0)[:, None] * nodes
         beta = -modes.T @ gradient / n
-        start = jnp.zeros_like(z)
+        start = None
         if self.baseline == "gaussian":
-            base = s * Gaussian()(jnp.concatenate([draws, h]), samples, covariance)
-            beta = beta - modes.T @ (at_draws.f.T @ base[:n]) / n
-            start = base[n:]
-        here = radial.profile(self.kernel, radial.squared_distances(z, nodes)).f
-        return (start + here @ modes @ beta) / s
+            start = Gaussian().fitted(samples, covariance)
+            beta = beta - modes.T @ (at_draws.f.T @ (s * start(draws))) / n
+        return jax.tree_util.Partial(self._at, middle, s, nodes, modes @ beta, start)
+
+    def _at(
+        self,
+        middle: Float[Array, "1 M"],
+        s: Float[Array, ""],
+        nodes: Float[Array, "P M"],
+        weights: Float[Array, "P M"],
+        start: Score | None,
+        h: Float[Array, "L M"],
+    ) -> Float[Array, "L M"]:
+        here = radial.profile(self.kernel, radial.squared_distances((h - middle) / s, nodes)).f
+        found = here @ weights / s
+        return found if start is None else start(h) + found
