@@ -26,7 +26,8 @@ from simulators.worlds.world import World
 
 NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
 WORLD_POINTS, WORLD_DRAWS = 200, 16  # of the normaliser, where a query costs a simulation and not a microsecond
-SCALE_POINTS, SCALE_DRAWS = 128, 512
+SCALE_POINTS, SCALE_DRAWS = 512, 512
+WORLD_SCALE_POINTS = 128
 DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
 
 
@@ -181,8 +182,8 @@ def assemble(
         key_scale, key_bank = jax.random.split(key)
         scale, sigma = _scales(
             prior, bound, system, normaliser, x, targets, noise_init, key_scale,
-            # so many rows no network goes through, and those that are looked at tell no more of the noise than it learns
-            with_noise=noise.learn and noise.marginal_share > 0 and len(x) <= SCALE_POINTS,
+            # of more rows than are looked at networks learn the noise better than those tell it
+            with_noise=noise.learn and noise.marginal_share > 0 and len(x) <= _most_rows(system),
         )  # fmt: skip
         arrays = Problem(
             x=pad_rows(x, length),
@@ -228,6 +229,11 @@ def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: 
     return Bank(points, np.moveaxis(system.simulate(key_phi, points, prior.draws), 0, -1))
 
 
+def _most_rows(system: System) -> int:
+    """Rows that the marginal likelihood looks at."""
+    return SCALE_POINTS if system.transition is not None else WORLD_SCALE_POINTS
+
+
 def _scales(
     prior: SimulatorPrior | GPPrior,
     bound: FunctionPrior,
@@ -254,9 +260,9 @@ def _scales(
     if not (np.isnan(given).any() or with_noise):
         return given, np.zeros(size)
     subset: slice | np.ndarray = slice(None)
-    if len(x) > SCALE_POINTS:  # the first ones may all be of one episode
+    if len(x) > _most_rows(system):  # the first ones may all be of one episode
         key, key_rows = jax.random.split(key)
-        subset = np.asarray(jax.random.choice(key_rows, len(x), (SCALE_POINTS,), replace=False))
+        subset = np.asarray(jax.random.choice(key_rows, len(x), (_most_rows(system),), replace=False))
     here = x[subset]
     samples = np.zeros((2, len(here), size))
     if prior.uses_simulator:

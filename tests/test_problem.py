@@ -179,10 +179,11 @@ def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
     system = system_of(declared(), (), 0)
     normaliser = normaliser_of(system, KEY)
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (400, 1)), rng.uniform(-2, 2, (400, 1))
-    gap = np.where(np.arange(400)[:, None] < 200, 0.0, 0.3 * states**2 + 0.3 * inputs)
+    rows = 3 * SCALE_POINTS
+    states, inputs = rng.uniform(-1, 1, (rows, 1)), rng.uniform(-2, 2, (rows, 1))
+    gap = np.where(np.arange(rows)[:, None] < rows // 2, 0.0, 0.3 * states**2 + 0.3 * inputs)
     x = system.encoding.to_x(states, inputs)
-    y = exact(states, inputs, np.ones((400, 1))) - states + gap
+    y = exact(states, inputs, np.ones((rows, 1))) - states + gap
 
     def chosen(rows, key):
         return assemble(
@@ -230,7 +231,7 @@ def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
     assert floor(marginal_share=0.5) == pytest.approx(floor() / 2, rel=1e-5)
     assert floor(marginal_share=0.0) == floor(learn=False) == pytest.approx(1e-3)
     assert floor(least_init=0.01) < 0.01  # never above the initial value
-    many = np.tile(x, (2, 1)), np.tile(y, (2, 1))
+    many = np.tile(x, (5, 1)), np.tile(y, (5, 1))
     done = assemble(
         system, normaliser, prior, Gaussian(), [many], {}, {},
         noise=NoiseModel(), pool=16, keys=[KEY], precision="float32",
