@@ -293,6 +293,36 @@ def test_a_prior_without_a_simulator_is_centred_on_the_mean_of_the_normaliser() 
     np.testing.assert_allclose(np.mean(centre(prior_of())), -2.5, atol=0.3)  # a line through 0 is 5/2 below the mean
 
 
+@pytest.mark.parametrize("precondition", [False, True])
+def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of_its_own_points(
+    precondition: bool,
+) -> None:
+    problem, prior, sets = problem_of(1.3 * X, kappa=0.3), prior_of(gap=True), 5
+    method = FSVGD(
+        particles=3, network=MLP((8,)), batch=4, fresh_points=4, pool=256, sets=sets, precondition=precondition
+    )
+    rule = method.bind(setting_of(prior), problem)
+    drawn, state = rule.draw(jax.random.key(0)), rule.init(jax.random.key(1))
+    assert drawn.x.shape == (sets, 8, 1)
+    assert len(np.unique(np.asarray(drawn.x[:, 4:]))) > 4 * 4  # fresh points of every set are its own
+    mean, precision = jax.tree.leaves(drawn.score)
+    for i in range(sets):
+        x = np.asarray(drawn.x[i])
+        np.testing.assert_allclose(x[:4], X[np.asarray(drawn.batch[i])])
+        # a line through 0 with a slope and an offset, and the gap
+        law = 3.0 * x @ x.T + 0.25 + 0.3**2 * oracles.squared_exponential(x[:, 0], x[:, 0], 1.0) + 1e-8 * np.eye(8)
+        whitened = np.asarray(precision[i, 0]) @ law
+        assert np.trace(whitened) / 8 == pytest.approx(1.0, abs=0.25)
+        if precondition:
+            np.testing.assert_allclose(
+                np.asarray(drawn.covariance[i, 0]) @ np.asarray(precision[i, 0]), np.eye(8), atol=1e-5
+            )
+    assert precondition or drawn.covariance is None
+    step = jax.jit(lambda key: rule.step(key, state, drawn)[1].loss)
+    losses = [float(step(key)) for key in jax.random.split(jax.random.key(2), 60)]
+    assert len(set(losses)) == sets
+
+
 SMALL: dict[str, Any] = {"network": MLP((8,)), "particles": 3, "batch": 4}
 FEW: dict[str, Any] = SMALL | {"fresh_points": 4, "pool": 8}
 EVERY = {
@@ -345,7 +375,7 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
         (lambda: SVGD(bandwidth="wide"), "method.bandwidth"), (lambda: Repulsive(bandwidth=-1.0), "method.bandwidth"),
         (lambda: ExactGP(particles=1), "method.particles"), (lambda: FunctionMAP(learning_rate=0.0), "method.learning_rate"),
         (lambda: dataclasses.replace(FSVGD(), bandwidth=0.0), "method.bandwidth"),
-        (lambda: FSVGD(pool=32), r"batch \+ fresh_points \(40\)"),
+        (lambda: FSVGD(sets=0), "method.sets"), (lambda: FSVGD(pool=32), r"batch \+ fresh_points \(40\)"),
         (lambda: Repulsive(precondition=True, prior_weight=0.0), "prior_weight"),
     ],
 )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.scores import radial
+from simpel_cli.scores.estimator import fitted
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod, field
@@ -252,3 +253,13 @@ def test_draws_of_the_gaussian_part_and_its_covariance_are_one_law(name: str) ->
 def test_wrong_settings_are_named(make: Callable[[], Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make()
+
+
+def test_an_estimator_of_a_users_that_can_only_be_called_is_asked_with_the_draws_it_was_fitted_to() -> None:
+    def own(h: Any, samples: Any, covariance: Any, gap: Any) -> Any:
+        return -h / (jnp.var(samples, axis=0) + jnp.diag(covariance) + jnp.var(gap, axis=0))[None]
+
+    random = np.random.default_rng(0)
+    h, samples, gap = (jnp.asarray(random.normal(size=(n, 3))) for n in (5, 20, 20))
+    every = jax.vmap(lambda s, g: fitted(own, s, jnp.eye(3), g))(samples[None], gap[None])
+    np.testing.assert_array_equal(jax.tree.map(lambda a: a[0], every)(h), own(h, samples, jnp.eye(3), gap))
