@@ -79,7 +79,7 @@ def configure(settings: Settings) -> "jax.Device":
     jax.config.update("jax_enable_x64", True)
     if settings.cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if settings.device == "auto":
         return jax.devices()[0]
