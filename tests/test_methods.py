@@ -33,6 +33,8 @@ X = RANDOM.uniform(-EDGE, EDGE, (N, 1))
 FIXED = NoiseModel(learn=False)
 PARAMS = (Quantity("a", "", -3.0, 3.0), Quantity("b", "", -1.0, 1.0, prior="normal"))
 GRID = np.linspace(-EDGE, EDGE, 21)[:, None]
+SMALL: dict[str, Any] = {"network": MLP((8,)), "particles": 3, "batch": 4}
+FEW: dict[str, Any] = SMALL | {"fresh_points": 4, "pool": 8}
 
 
 def line(x: jax.Array, phi: jax.Array) -> jax.Array:
@@ -183,6 +185,20 @@ def test_greybox_learns_what_the_simulator_leaves() -> None:
     assert errors[0] < 0.35 * errors[1]
 
 
+@pytest.mark.parametrize(("learn", "share"), [(True, 1.0), (True, 0.5), (True, 0.0), (False, 1.0)])
+def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual(learn: bool, share: float) -> None:
+    """A wave that the simulator lacks is no noise to it; half of the rows are padding."""
+    x = np.random.default_rng(3).uniform(-EDGE, EDGE, (120, 1))
+    y = 1.3 * x - 0.4 + 0.5 * np.sin(3 * x) + NOISE * np.random.default_rng(4).normal(size=x.shape)
+    noise = NoiseModel(learn=learn, marginal_share=share)
+    method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, noise=noise, **FEW), GPPrior(lengthscale=0.7))
+    problem = problem_of(y, x=x)._replace(noise_init=jnp.ones(1))
+    state = method.bind(setting_of(prior_of()), problem).init(jax.random.key(0))
+    expected = share * NOISE if learn and share else 0.01 * NOISE
+    np.testing.assert_allclose(state.noise_floor, expected, rtol=0.2)
+    assert float(method.residual.noise.std(state.residual.noise, state.noise_floor)[0]) == pytest.approx(1.0, rel=1e-3)
+
+
 def test_draws_of_parameters_of_which_only_the_product_is_told_stay_on_their_ridge() -> None:
     def product(x: jax.Array, phi: jax.Array) -> jax.Array:
         return phi[:1] * phi[1:] * x
@@ -305,7 +321,7 @@ def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of
     drawn, state = rule.draw(jax.random.key(0)), rule.init(jax.random.key(1))
     assert drawn.x.shape == (sets, 8, 1)
     assert len(np.unique(np.asarray(drawn.x[:, 4:]))) > 4 * 4  # fresh points of every set are its own
-    mean, precision = jax.tree.leaves(drawn.score)
+    _, precision = jax.tree.leaves(drawn.score)
     for i in range(sets):
         x = np.asarray(drawn.x[i])
         np.testing.assert_allclose(x[:4], X[np.asarray(drawn.batch[i])])
@@ -323,8 +339,6 @@ def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of
     assert len(set(losses)) == sets
 
 
-SMALL: dict[str, Any] = {"network": MLP((8,)), "particles": 3, "batch": 4}
-FEW: dict[str, Any] = SMALL | {"fresh_points": 4, "pool": 8}
 EVERY = {
     "fsvgd": FSVGD(steps=6, **FEW), "map": FunctionMAP(steps=6, **FEW), "repulsive": Repulsive(steps=6, **FEW),
     "svgd": SVGD(steps=6, **SMALL), "sysid": SysID(steps=6, starts=2, particles=3),

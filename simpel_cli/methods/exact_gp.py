@@ -19,19 +19,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.errors import ConfigError
 from simpel_cli.gp import gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.methods.likeliest_noise import Spectrum, likeliest, spectrum
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.predictive import Predictive
 
-NOISES = 41  # levels that are tried, from the floor to the targets' spread
-
 
 class State(NamedTuple):
-    """Everything that the training data say: parameters, spectrum of the correlation at the inputs, weights, noise."""
+    """Everything that the training data say: parameters, residuals, noise."""
 
     phi: Float[Array, " dp"]
-    values: Float[Array, " m"]
-    vectors: Float[Array, "m m"]
-    turned: Float[Array, "m dy"]  # residuals along the eigenvectors
+    data: Spectrum
     noise_std: Float[Array, " dy"]
     loss: Float[Array, ""]
 
@@ -76,9 +73,7 @@ class ExactGP:
             raise ConfigError("method: gp needs the gap process of prior=simulator; prior=simulator_only has none.")
         kernel, scale, dtype = prior.kernel, problem.normaliser, problem.x.dtype
         counts = (jnp.arange(problem.x.shape[0], dtype=jnp.int32) < problem.m).astype(jnp.float64)
-        kappa, floor, typical = (
-            jnp.asarray(a).astype(jnp.float64) for a in (problem.gap_scale, problem.noise_floor, problem.noise_init)
-        )
+        kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
 
         def simulated(phi: Float[Array, " dp"], x: Float[Numbers, "n dx"]) -> Float[Array, "n dy"]:
             return (jax.vmap(run, in_axes=(0, None))(jnp.asarray(x), phi) - scale.y_mean[None]) / scale.y_std[None]
@@ -86,52 +81,32 @@ class ExactGP:
         def scaled(x: Float[Numbers, "n dx"]) -> Float[Array, "n dx"]:
             return (scale.x(x) * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
 
-        def likely(
-            kappa: Float[Array, ""], floor: Float[Array, ""], typical: Float[Array, ""], turned: Float[Array, " m"],
-            values: Float[Array, " m"],
-        ) -> tuple[Float[Array, ""], Float[Array, ""]]:  # fmt: skip
-            """Noise of one output with the largest penalised marginal likelihood, and minus its logarithm."""
-            levels = jnp.exp(jnp.linspace(jnp.log(floor), jnp.log(jnp.maximum(1.0, 2 * floor)), NOISES))
-            levels = levels if self.noise.learn else typical[None]
-
-            def minus(sigma: Float[Array, ""]) -> Float[Array, ""]:
-                total = kappa**2 * values + sigma**2 + prior.white_variance
-                # padding has eigenvalue 0 and no residual: its log determinant is taken off
-                empty = (counts.shape[0] - jnp.sum(counts)) * jnp.log(sigma**2 + prior.white_variance)
-                data = 0.5 * jnp.sum(turned**2 / total + jnp.log(total)) - 0.5 * empty
-                return data + 0.5 * (jnp.log(sigma / typical) / self.noise.prior_std) ** 2
-
-            losses = jax.vmap(minus)(levels)
-            best = jnp.argmin(losses)
-            return levels[best], losses[best]
-
         def init(key: PRNGKeyArray) -> State:
             phi = identified(self.sysid, setting, problem, key)
             known = scaled(problem.x)
-            values, vectors = jnp.linalg.eigh(gram(kernel, known, known) * counts[:, None] * counts[None])
-            values = jnp.maximum(values, 0.0)
-            left = (jnp.asarray(problem.y) - simulated(phi, problem.x)).astype(jnp.float64) * counts[:, None]
-            turned = vectors.T @ left
-            sigma, loss = jax.vmap(likely, in_axes=(0, 0, 0, 1, None))(kappa, floor, typical, turned, values)
-            whole = jnp.sum(loss) / problem.m.astype(jnp.float64)
-            return State(phi, values, vectors, turned, sigma.astype(dtype), whole.astype(dtype))
+            left = jnp.asarray(problem.y) - simulated(phi, problem.x)
+            data = spectrum(gram(kernel, known, known), left, problem.m)
+            sigma, loss = likeliest(
+                data, kappa, prior.white_variance, self.noise, problem.noise_floor, problem.noise_init
+            )
+            return State(phi, data, sigma.astype(dtype), (jnp.sum(loss) / jnp.sum(counts)).astype(dtype))
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
             return state, Info(state.loss, state.noise_std, jnp.zeros((), dtype))
 
         def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
             """Mean and standard deviation of the function, normalised."""
-            reach = (gram(kernel, scaled(x), scaled(problem.x)) * counts[None]) @ state.vectors
+            reach = (gram(kernel, scaled(x), scaled(problem.x)) * counts[None]) @ state.data.vectors
 
             def of_output(
                 kappa: Float[Array, ""], sigma: Float[Array, ""], turned: Float[Array, " m"]
             ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-                total = kappa**2 * state.values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
+                total = kappa**2 * state.data.values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
                 taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
                 std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + prior.white_variance)
                 return kappa**2 * (reach @ (turned / total)), std
 
-            mean, std = jax.vmap(of_output, in_axes=(0, 0, 1), out_axes=1)(kappa, state.noise_std, state.turned)
+            mean, std = jax.vmap(of_output, in_axes=(0, 0, 1), out_axes=1)(kappa, state.noise_std, state.data.turned)
             return simulated(state.phi, x) + mean.astype(dtype), std.astype(dtype)
 
         def quantiles() -> Float[Array, "L dy"]:
