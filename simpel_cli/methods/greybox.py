@@ -88,7 +88,7 @@ class GreyBox:
 
         def left(predicted: Float[Array, "m dy"]) -> Float[Array, "m dy"]:
             """Normalised targets of the second stage."""
-            return problem.y - (predicted - scale.y_mean[None]) / scale.y_std[None]
+            return jnp.asarray(problem.y) - (predicted - scale.y_mean[None]) / scale.y_std[None]
 
         def least_noise(predicted: Float[Array, "m dy"]) -> Float[Array, " dy"]:
             """The floor that every method has (`NoiseModel.marginal_share`), under the residual's prior."""
