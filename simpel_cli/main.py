@@ -23,8 +23,23 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems.",
 )
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"simpel {version('simpel')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _simpel(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None:
+    """Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems."""
+
 
 Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.")

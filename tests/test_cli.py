@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -374,6 +375,9 @@ class TestWords:
         assert result.code == 0
         for verb in ("fit", "evaluate", "sweep", "simulate"):
             assert verb in result.out
+
+    def test_version(self, tmp_path: Path) -> None:
+        assert run(tmp_path, "--version").split() == ["simpel", metadata.version("simpel")]
 
     @pytest.mark.parametrize("verb", ["fit", "evaluate", "sweep", "simulate"])
     def test_help_of_a_verb_has_two_examples(self, verb: str, tmp_path: Path) -> None:
