@@ -68,11 +68,19 @@ def _learning_curves(path: Path) -> Any:
     if not rows:
         return None
     outputs = distinct(r["output"] for r in rows if r["metric"] == "noise_std")
-    figure, (loss, noise) = new_figure(2, beside=len(outputs))
+    moving = any(r["metric"] == "mean_kernel" and r["value"] > 0 for r in rows)
+    figure, (loss, *apart, noise) = new_figure(2 + moving, beside=len(outputs))
     for i, seed in enumerate(distinct(r["seed"] for r in rows)):
         own = [r for r in rows if r["seed"] == seed]
         curve = [(r["step"], r["value"]) for r in own if r["metric"] == "loss"]
         loss.plot(*zip(*curve, strict=True), color=COLOURS[0], alpha=0.9 if i == 0 else 0.4, linewidth=1)
+        for axis in apart:  # a kernel exp(-d^2/2) of the typical distance d
+            widths = [
+                (r["step"], max(-2 * np.log(max(r["value"], 1e-30)), 0.0) ** 0.5)
+                for r in own
+                if r["metric"] == "mean_kernel"
+            ]
+            axis.plot(*zip(*widths, strict=True), color=COLOURS[0], alpha=0.9 if i == 0 else 0.4, linewidth=1)
         for j, output in enumerate(outputs):
             line = [(r["step"], r["value"]) for r in own if r["metric"] == "noise_std" and r["output"] == output]
             unit = next(r["unit"] for r in own if r["metric"] == "noise_std" and r["output"] == output)
@@ -87,6 +95,9 @@ def _learning_curves(path: Path) -> Any:
     late = [r["value"] for r in rows if r["metric"] == "loss" and r["step"] >= 0.05 * rows[-1]["step"]]
     margin = 0.05 * (max(late) - min(late)) + 1e-9
     loss.set_ylim(min(late) - margin, max(late) + margin)
+    for axis in apart:
+        axis.set(title="distance between particles", xlabel="step", ylabel="kernel widths")
+        axis.set_ylim(bottom=0)
     noise.set(title="learned noise", xlabel="step", ylabel="standard deviation", yscale="log")
     legend_beside(noise)
     return figure
