@@ -36,6 +36,7 @@ class Settings:
         device: `auto`, `cpu` or `gpu`.
         cache: keep compiled programs in the user's cache directory.
         quiet: print errors only.
+        figures: draw figures; without them the report has its tables, and a small job of a large sweep ends sooner.
         plugins: packages of the user's that `_target_` and callables may name.
     """
 
@@ -46,6 +47,7 @@ class Settings:
     device: str = "auto"
     cache: bool = True
     quiet: bool = False
+    figures: bool = True
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

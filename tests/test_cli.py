@@ -36,7 +36,7 @@ def run(cwd: Path, *words: object) -> str:
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the directory of a fit."""
     folder = tmp_path_factory.mktemp("fitted")
-    run(folder, *FIT, "hydra.run.dir=fit", "evaluation.horizon=0.5")
+    run(folder, *FIT, "hydra.run.dir=fit", "evaluation.horizon=0.5", "run.figures=true")
     return folder / "fit"
 
 

@@ -13,7 +13,7 @@ from command_line import PATIENCE, process, simpel, start
 
 FIT = (
     "fit", "experiment=pendulum", "method.steps=6000", "method.particles=6", "method.network.hidden=[32,32]",
-    "method.pool=64", "prior.draws=64",
+    "method.pool=64", "prior.draws=64", "run.figures=false",
 )  # fmt: skip
 
 
@@ -93,7 +93,7 @@ def test_killed_before_the_first_checkpoint(uninterrupted: Path, tmp_path: Path)
     assert state(run) == state(uninterrupted)
 
 
-def test_interrupted_while_figures_are_drawn(uninterrupted: Path, tmp_path: Path) -> None:
+def test_interrupted_while_the_report_is_written(uninterrupted: Path, tmp_path: Path) -> None:
     """All steps are done and the metric table is written: nothing of it is lost."""
     run = tmp_path / "run"
     shutil.copytree(uninterrupted, run)

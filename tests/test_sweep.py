@@ -23,6 +23,8 @@ class TestSweep:
         assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
         status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(2)]
         assert status == ["done", "failed"]
+        assert (tmp_path / "sweep" / "0" / "report.html").exists()
+        assert not list((tmp_path / "sweep" / "0").glob("*.png"))  # run.figures=false
         single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
         assert single.code == 0
         assert [r["value"] for r in table] == [r["value"] for r in rows(tmp_path / "single", split="test")]

@@ -130,7 +130,7 @@ def publish(
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
         lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
-        sections=[*tables, run, checks, *(figure(path) for path in draw_run(directory))],
+        sections=[*tables, run, checks, *(figure(path) for path in (draw_run(directory) if s.figures else []))],
         commands=next_commands,
         config=config,
     )
