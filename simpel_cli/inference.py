@@ -123,8 +123,8 @@ class Info(NamedTuple):
 class Inference(NamedTuple):
     """An inference rule bound to a problem; every function is pure.
 
-    init(key) -> State; draw(key) -> Draws, random material for a stretch of steps that is not worth keeping;
-    step(key, State, Draws) -> (State, Info); predict(State, x in data units) -> Predictive in data units;
+    init(key) -> State; draw(key) -> random material for a stretch of steps that is not worth keeping;
+    step(key, State, what was drawn) -> (State, Info); predict(State, x in data units) -> Predictive in data units;
     members(State, x of every particle) -> targets of every particle, for roll-outs along each particle's own path.
     """
 
@@ -186,7 +186,7 @@ class NoiseModel:
         measured_share: nor does it fall below this share of the measurement noise that the data YAML declares. 0.7 is the
             sine's or cosine's share of an angle's noise. (An estimate from the data is an upper bound, hence no floor.)
         marginal_share: nor, where it is learned from no more than 512 transitions (128 of a world), below this share of
-            the noise with the largest marginal likelihood under the method's prior (`gap.py`), or the initial value if that
+            the noise with the largest marginal likelihood under the method's prior, or the initial value if that
             is less. A network that goes through every one of a few points would else learn that there is no noise; where
             all functions that the prior allows are integrated out, it cannot. 0 switches that off.
         prior_std: standard deviation of log sigma under its prior.
@@ -214,7 +214,7 @@ class NoiseModel:
         self, floor: Float[Numbers, " dy"] | float, least: Float[Numbers, " dy"], init: Float[Numbers, " dy"]
     ) -> Float[Numbers, " dy"]:
         """Return a floor of sigma that is `least` where that is higher, and below the initial value."""
-        return np.clip(least, floor, 0.99 * np.asarray(init))
+        return jnp.clip(jnp.asarray(least), floor, 0.99 * jnp.asarray(init))
 
     def init(self, sigma: Float[Numbers, " dy"], floor: Float[Numbers, " dy"]) -> Float[Array, " dy"]:
         """Return rho for a standard deviation."""

@@ -136,14 +136,22 @@ class GPPrior:
     Args:
         kernel: correlation function.
         lengthscale: in normalised inputs.
-        scale: standard deviation in normalised outputs.
+        scale: standard deviation in normalised outputs; `auto`: chosen per output by marginal likelihood.
         white_variance: variance of the white model error, normalised output units.
     """
 
     kernel: Kernel = SquaredExponential()
     lengthscale: float = 0.4
-    scale: float = 1.0
+    scale: float | str = 1.0
     white_variance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if isinstance(self.scale, str) and self.scale != "auto":
+            raise ConfigError(f"prior.scale: got {self.scale!r}; allowed are auto and a positive number.")
+        for name in ("lengthscale", "scale", "white_variance"):
+            value = getattr(self, name)
+            if not isinstance(value, str) and not value > 0:
+                raise ConfigError(f"prior.{name}: got {value}; it must be positive.")
 
     uses_simulator = False
     draws = 2  # two zero draws: mean and covariance of the (absent) simulator part are exactly zero

@@ -183,7 +183,7 @@ def assemble(
         scale, sigma = _scales(
             prior, bound, system, normaliser, x, targets, noise_init, key_scale,
             # of more rows than are looked at networks learn the noise better than those tell it
-            with_noise=noise.learn and noise.marginal_share > 0 and len(x) <= _most_rows(system),
+            with_noise=noise.learn and noise.marginal_share > 0 and len(x) <= _most_rows(prior, system),
         )  # fmt: skip
         arrays = Problem(
             x=pad_rows(x, length),
@@ -192,7 +192,7 @@ def assemble(
             normaliser=normaliser,
             gap_scale=scale,
             noise_init=noise_init,
-            noise_floor=noise.raised(noise_floor, noise.marginal_share * sigma, noise_init),
+            noise_floor=np.asarray(noise.raised(noise_floor, noise.marginal_share * sigma, noise_init)),
             bank=_bank(prior, system, pad_rows(x, length), pool, key_bank),
         )
         problems.append(arrays)
@@ -229,9 +229,10 @@ def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: 
     return Bank(points, np.moveaxis(system.simulate(key_phi, points, prior.draws), 0, -1))
 
 
-def _most_rows(system: System) -> int:
+def _most_rows(prior: SimulatorPrior | GPPrior, system: System) -> int:
     """Rows that the marginal likelihood looks at."""
-    return SCALE_POINTS if system.transition is not None else WORLD_SCALE_POINTS
+    queries = prior.uses_simulator and system.transition is None
+    return WORLD_SCALE_POINTS if queries else SCALE_POINTS
 
 
 def _scales(
@@ -260,9 +261,9 @@ def _scales(
     if not (np.isnan(given).any() or with_noise):
         return given, np.zeros(size)
     subset: slice | np.ndarray = slice(None)
-    if len(x) > _most_rows(system):  # the first ones may all be of one episode
+    if len(x) > _most_rows(prior, system):  # the first ones may all be of one episode
         key, key_rows = jax.random.split(key)
-        subset = np.asarray(jax.random.choice(key_rows, len(x), (_most_rows(system),), replace=False))
+        subset = np.asarray(jax.random.choice(key_rows, len(x), (_most_rows(prior, system),), replace=False))
     here = x[subset]
     samples = np.zeros((2, len(here), size))
     if prior.uses_simulator:

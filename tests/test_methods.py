@@ -187,8 +187,8 @@ def test_greybox_learns_what_the_simulator_leaves() -> None:
 
 @pytest.mark.parametrize(("learn", "share"), [(True, 1.0), (True, 0.5), (True, 0.0), (False, 1.0)])
 def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual(learn: bool, share: float) -> None:
-    """A wave that the simulator lacks is no noise to it; half of the rows are padding."""
-    x = np.random.default_rng(3).uniform(-EDGE, EDGE, (120, 1))
+    """A wave that the simulator lacks is no noise to it; nearly half of the rows are padding."""
+    x = np.random.default_rng(3).uniform(-EDGE, EDGE, (70, 1))
     y = 1.3 * x - 0.4 + 0.5 * np.sin(3 * x) + NOISE * np.random.default_rng(4).normal(size=x.shape)
     noise = NoiseModel(learn=learn, marginal_share=share)
     method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, noise=noise, **FEW), GPPrior(lengthscale=0.7))
@@ -196,7 +196,39 @@ def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual
     state = method.bind(setting_of(prior_of()), problem).init(jax.random.key(0))
     expected = share * NOISE if learn and share else 0.01 * NOISE
     np.testing.assert_allclose(state.noise_floor, expected, rtol=0.2)
-    assert float(method.residual.noise.std(state.residual.noise, state.noise_floor)[0]) == pytest.approx(1.0, rel=1e-3)
+    noise_std = method.residual.noise.std(state.residual.noise, state.noise_floor / state.scale) * state.scale
+    np.testing.assert_allclose(noise_std, 1.0, rtol=1e-3)
+    np.testing.assert_allclose(state.scale, 1.0)
+
+
+@pytest.mark.parametrize("wave", [0.0, 0.02, 0.5])
+def test_the_scale_of_what_greybox_learns_is_what_the_simulator_leaves(wave: float) -> None:
+    x = np.random.default_rng(3).uniform(-EDGE, EDGE, (100, 1))
+    y = 1.3 * x - 0.4 + wave * np.sin(3 * x) + 1e-3 * np.random.default_rng(4).normal(size=x.shape)
+    method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, **FEW), GPPrior(lengthscale=0.7, scale="auto"))
+    rule = method.bind(setting_of(prior_of()), problem_of(y, x=x))
+    state = rule.init(jax.random.key(0))
+    assert 0.3 * wave <= float(state.scale[0]) <= max(2 * wave, 3e-3)
+    assert 0.5e-3 < float(state.noise_floor[0]) < 2e-3  # that of the problem is 0.001
+    _, info = rule.step(jax.random.key(1), state, rule.draw(jax.random.key(2)))
+    np.testing.assert_allclose(info.noise_std, NOISE, rtol=1e-3)  # in the units of the targets
+    close = jax.tree.map(lambda a: 0 * a, state.residual.particles)
+    nothing = rule.predict(state._replace(residual=state.residual._replace(particles=close)), jnp.asarray(x))
+    np.testing.assert_allclose(nothing.noise_std, NOISE, rtol=1e-3)
+    assert np.std(np.asarray(nothing.mean) - y) < 0.8 * wave + 2e-3  # the identified line alone
+    one = rule.predict(state, jnp.asarray(x)).particles - nothing.particles
+    assert np.std(np.asarray(one)) < 3 * float(state.scale[0])
+
+
+def test_greybox_of_many_rows_looks_at_some_of_all_of_them() -> None:
+    """The first half agrees with the simulator, the second has a wave."""
+    x = np.random.default_rng(3).uniform(-EDGE, EDGE, (1500, 1))
+    wave = np.where(np.arange(1500)[:, None] < 750, 0.0, 0.5 * np.sin(3 * x))
+    method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, **FEW), GPPrior(lengthscale=0.7, scale="auto"))
+    problem = problem_of(1.3 * x - 0.4 + wave, x=x)
+    state = method.bind(setting_of(prior_of()), problem).init(jax.random.key(0))
+    np.testing.assert_array_equal(state.noise_floor, problem.noise_floor)
+    assert float(state.noise_floor[0]) < 0.05 < float(state.scale[0])
 
 
 def test_draws_of_parameters_of_which_only_the_product_is_told_stay_on_their_ridge() -> None:
@@ -313,7 +345,7 @@ def test_a_prior_without_a_simulator_is_centred_on_the_mean_of_the_normaliser() 
 def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of_its_own_points(
     precondition: bool,
 ) -> None:
-    problem, prior, sets = problem_of(1.3 * X, kappa=0.3), prior_of(gap=True), 5
+    problem, prior, sets = problem_of(1.3 * X, kappa=0.3), prior_of(gap=True), 9
     method = FSVGD(
         particles=3, network=MLP((8,)), batch=4, fresh_points=4, pool=256, sets=sets, precondition=precondition
     )

@@ -6,11 +6,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import NoiseModel, padded_length
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
-from simpel_cli.problem import SCALE_POINTS, WORLD_POINTS, assemble, normaliser_of, system_of
+from simpel_cli.problem import (
+    SCALE_DRAWS,
+    SCALE_POINTS,
+    WORLD_POINTS,
+    WORLD_SCALE_POINTS,
+    assemble,
+    normaliser_of,
+    system_of,
+)  # fmt: skip
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Declared, ModelError
 from simulators.worlds.callable_world import CallableWorld
@@ -214,10 +224,10 @@ def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
     system = system_of(declared(), (), 0)
     normaliser = normaliser_of(system, KEY)
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (120, 1)), rng.uniform(-2, 2, (120, 1))
+    states, inputs = rng.uniform(-1, 1, (SCALE_POINTS + 1, 1)), rng.uniform(-2, 2, (SCALE_POINTS + 1, 1))
     x = system.encoding.to_x(states, inputs)
-    wave = gap * np.cos(4 * states) + NOISY * rng.normal(size=(120, 1))
-    y = exact(states, inputs, np.ones((120, 1))) - states + wave * normaliser.y_std
+    wave = gap * np.cos(4 * states) + NOISY * rng.normal(size=states.shape)
+    y = exact(states, inputs, np.ones(states.shape)) - states + wave * normaliser.y_std
 
     def floor(rows=120, **fields):
         done = assemble(
@@ -226,17 +236,49 @@ def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
         )  # fmt: skip
         return float(done.problems.noise_floor[0, 0])
 
-    left = np.hypot(NOISY, gap * np.std(np.cos(4 * states))) if prior.gap and prior.gap.scale == 0 else NOISY
+    unexplained = gap * np.std(np.cos(4 * states)) if prior.gap and prior.gap.scale == 0 else 0.0
+    left = (NOISY**2 + unexplained**2 - prior.white_variance) ** 0.5
     assert floor() == pytest.approx(left, rel=0.25)  # 120 values: 6 % standard error
     assert floor(marginal_share=0.5) == pytest.approx(floor() / 2, rel=1e-5)
     assert floor(marginal_share=0.0) == floor(learn=False) == pytest.approx(1e-3)
     assert floor(least_init=0.01) < 0.01  # never above the initial value
-    many = np.tile(x, (5, 1)), np.tile(y, (5, 1))
-    done = assemble(
-        system, normaliser, prior, Gaussian(), [many], {}, {},
-        noise=NoiseModel(), pool=16, keys=[KEY], precision="float32",
-    )  # fmt: skip
-    assert float(done.problems.noise_floor[0, 0]) == pytest.approx(1e-3)  # so many rows teach the noise themselves
+    assert floor(400) == pytest.approx(left, rel=0.15)
+    assert floor(SCALE_POINTS + 1) == pytest.approx(1e-3)  # so many rows teach the noise themselves
+
+
+@pytest.mark.parametrize(("prior", "asked"), [(SimulatorPrior(), True), (GPPrior(scale="auto"), False)])
+def test_a_world_is_asked_for_the_scales_at_few_points_and_for_a_gp_not_at_all(prior, asked):
+    sizes = []
+
+    def counted(states, inputs, params):
+        sizes.append(len(states))
+        return exact(states, inputs, params)
+
+    problems = assembled(system_of(world(counted), (), 0), prior, n=300)[1].problems
+    assert (WORLD_SCALE_POINTS * SCALE_DRAWS in sizes) == asked
+    assert (float(problems.noise_floor[0, 0]) > 1.1e-3) == (not asked)  # 300 rows: more than a world is asked at
+    assert 0.01 < float(problems.gap_scale[0, 0]) < 10
+
+
+@pytest.mark.parametrize("gap", [None, 0.2])
+def test_the_likeliest_scales_have_no_likelier_neighbour(gap):
+    """Against the density of a normal law, by scipy."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=60)
+    correlation = np.exp(-((x[:, None] - x[None]) ** 2) / 2)
+    samples = rng.normal(size=(100, 2)) @ np.stack([x, np.ones(60)])
+    y = 0.3 * x + rng.multivariate_normal(np.zeros(60), 0.2**2 * correlation) + 0.05 * rng.normal(size=60)
+
+    def likely(kappa, sigma):
+        law = np.cov(samples, rowvar=False) + kappa**2 * correlation + (1e-4 + sigma**2) * np.eye(60)
+        data = stats.multivariate_normal(samples.mean(axis=0), law).logpdf(y)
+        return data - np.log(kappa / 0.1) ** 2 / 8 * (gap is None) - np.log(sigma / 0.1) ** 2 / 2
+
+    best = marginal_likelihood_scales(samples, correlation, y, 0.1, 1e-4, gap)
+    kappas = [1.0] if gap else [0.97, 1.0, 1.03]
+    around = [likely(a * best.gap, b * best.noise) for a in kappas for b in (0.97, 1.0, 1.03)]
+    assert np.argmax(around) == len(around) // 2
+    assert best.noise == pytest.approx(0.05, rel=0.3)
 
 
 def test_learned_noise_starts_at_and_stays_above_what_was_measured():

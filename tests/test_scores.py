@@ -255,6 +255,29 @@ def test_wrong_settings_are_named(make: Callable[[], Any], words: str) -> None:
         make()
 
 
+class Halved(Gaussian):
+    """A user's, that changes what another says."""
+
+    def __call__(self, *given: Any) -> Any:
+        return super().__call__(*given) / 2
+
+
+class Bare(Gaussian):
+    """A user's, that returns something which cannot be stacked."""
+
+    def fitted(self, *given: Any) -> Any:
+        return lambda h: -h
+
+
+def test_a_users_estimator_that_extends_another_is_called_and_one_that_cannot_be_stacked_is_named() -> None:
+    h, samples = jnp.ones((5, 3)), jnp.asarray(np.random.default_rng(0).normal(size=(20, 3)))
+    whole = Gaussian()(h, samples, jnp.eye(3))
+    np.testing.assert_array_equal(fitted(Halved(), samples, jnp.eye(3), None)(h), whole / 2)
+    np.testing.assert_array_equal(fitted(Gaussian(), samples, jnp.eye(3), None)(h), whole)
+    with pytest.raises(ConfigError, match=r"Bare\.fitted returned a function; it must return a jax"):
+        fitted(Bare(), samples, jnp.eye(3), None)
+
+
 def test_an_estimator_of_a_users_that_can_only_be_called_is_asked_with_the_draws_it_was_fitted_to() -> None:
     def own(h: Any, samples: Any, covariance: Any, gap: Any) -> Any:
         return -h / (jnp.var(samples, axis=0) + jnp.diag(covariance) + jnp.var(gap, axis=0))[None]

@@ -86,10 +86,8 @@ class ExactGP:
             known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = spectrum(gram(kernel, known, known), left, problem.m)
-            sigma, loss = likeliest(
-                data, kappa, prior.white_variance, self.noise, problem.noise_floor, problem.noise_init
-            )
-            return State(phi, data, sigma.astype(dtype), (jnp.sum(loss) / jnp.sum(counts)).astype(dtype))
+            best = likeliest(data, kappa, prior.white_variance, self.noise, problem.noise_floor, problem.noise_init)
+            return State(phi, data, best.noise.astype(dtype), (jnp.sum(best.loss) / jnp.sum(counts)).astype(dtype))
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
             return state, Info(state.loss, state.noise_std, jnp.zeros((), dtype))

@@ -63,8 +63,14 @@ def stein_velocity(
     kernel, width_squared = kernel_between(flat, bandwidth)
     # sum_l grad_{h_l} K_li = sum_l K_li (h_i - h_l) / s^2
     repulsion = (jnp.sum(kernel, axis=0)[:, None] * flat - kernel.T @ flat) / width_squared
-    off_diagonal = (jnp.sum(kernel) - n) / max(n * (n - 1), 1)
-    return ((kernel.T @ drive + repulsion) / n).reshape(h.shape), off_diagonal
+    return ((kernel.T @ drive + repulsion) / n).reshape(h.shape), between(kernel)
+
+
+def between(kernel: Float[Array, "L L"]) -> Float[Array, ""]:
+    """Return the mean kernel between two particles."""
+    n = kernel.shape[0]
+    # summed without the diagonal: taken off a sum in float32 it would take small kernels with it
+    return jnp.sum(jnp.where(jnp.eye(n, dtype=bool), 0.0, kernel)) / max(n * (n - 1), 1)
 
 
 def kernel_between(flat: Float[Array, "L d"], bandwidth: float | str) -> tuple[Float[Array, "L L"], Float[Array, ""]]:

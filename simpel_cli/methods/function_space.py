@@ -30,6 +30,7 @@ from simpel_cli.nets import MLP
 from simpel_cli.scores.estimator import Score, fitted
 from simpel_cli.scores.gaussian import moments
 
+MOST_SETS = 512  # of a stretch, where there are many data
 LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
 
 
@@ -66,7 +67,8 @@ class FunctionSpace(ABC):
         batch: training points per step, at most; drawn without replacement.
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
-        sets: measurement sets that a stretch of steps chooses from.
+        sets: measurement sets that a stretch of steps chooses from, at least; more, up to 512, where so many batches are not
+            as many as the data.
         prior_weight: exponent of the prior; 1 is Bayes.
         precondition: go in Newton's direction of the function values (`preconditioner.py`): for rules whose particles climb
             on their own, which else need many times the steps where data are few.
@@ -117,6 +119,7 @@ class FunctionSpace(ABC):
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
         optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
 
+        count = max(self.sets, min(-(-n_rows // self.batch), MOST_SETS))
         networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
         def draw(key: PRNGKeyArray) -> Sets:
@@ -128,7 +131,7 @@ class FunctionSpace(ABC):
                 batch, is_data, rows = measurement_set(key_points)
                 return Sets(x[rows], batch, is_data, *of_prior(key_gap, x[rows], samples[rows]))
 
-            return jax.lax.map(one, jax.random.split(key_sets, self.sets))
+            return jax.lax.map(one, jax.random.split(key_sets, count))
 
         def bank(key: PRNGKeyArray) -> tuple[Float[Array, "B dx"], Float[Array, "B dy N"]]:
             """Training inputs, points of the domain and prior draws at them, normalised."""
@@ -161,6 +164,10 @@ class FunctionSpace(ABC):
         ) -> tuple[Score, Float[Array, "dy k k"] | None]:
             """Score and covariance of the prior on a set, per output."""
             covariance = setting.prior.covariance(x, problem.gap_scale)
+            whole = None
+            if self.precondition:
+                drawn = jnp.transpose(samples, (1, 2, 0))
+                whole = jax.vmap(lambda s: moments(s)[1])(drawn) + covariance.astype(jnp.float64)
             gap = None
             if setting.score.gap_draws:
                 # a prior without a simulator brings two draws, both zero: enough for moments, not for an estimate
@@ -168,14 +175,11 @@ class FunctionSpace(ABC):
                 factor = jnp.linalg.cholesky(covariance.astype(jnp.float64)).astype(dtype)
                 gap = jnp.einsum("dkj,jdn->dnk", factor, jax.random.normal(key, samples.shape, dtype))
             by_output = jnp.transpose(samples, (1, 2, 0))
-            score = jax.vmap(lambda s, c, g: fitted(setting.score, s, c, g))(by_output, covariance, gap)
-            if not self.precondition:
-                return score, None
-            return score, jax.vmap(lambda s: moments(s)[1])(by_output) + covariance.astype(jnp.float64)
+            return jax.vmap(lambda s, c, g: fitted(setting.score, s, c, g))(by_output, covariance, gap), whole
 
         def step(key: PRNGKeyArray, state: State, sets: Sets) -> tuple[State, Info]:
-            chosen = jax.random.randint(key, (), 0, self.sets)
-            x, batch, is_data, of_output, covariance = jax.tree.map(lambda a: a[chosen], sets)
+            chosen = jax.random.randint(key, (), 0, count)
+            x, batch, is_data, scores, covariance = jax.tree.map(lambda a: a[chosen], sets)
             b, counted = batch.shape[0], is_data.astype(dtype)
             y = problem.y[batch]
             h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
@@ -184,7 +188,7 @@ class FunctionSpace(ABC):
             fit, (score_data, score_noise) = jax.value_and_grad(
                 lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
             )(h[:, :b], state.noise)
-            prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(of_output, h)
+            prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(scores, h)
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
             if covariance is not None:

@@ -2,8 +2,8 @@
 
     y = g(x, phi_hat) + h~(x) + noise,    phi_hat: MAP (`sysid`),    h~: FSVGD
 
-The residual is scaled by the targets' spread and not shifted. The parameters are not looked at again, so the spread of the
-posterior is that of the residual alone.
+The residual is not shifted, and scaled by what its marginal likelihood says that the simulator leaves (`prior.scale`). The
+parameters are not looked at again, so the spread of the posterior is that of the residual alone.
 
 Reference: Psichogios and Ungar (1992), A hybrid neural network - first principles approach to process modeling.
 """
@@ -27,10 +27,19 @@ MOST_ROWS = 512  # of which the marginal likelihood is taken
 
 
 class State(NamedTuple):
-    """Identified parameters, what their simulator predicts of the training targets, least noise, and the networks."""
+    """What the first stage found, and the networks.
+
+    Args:
+        phi: identified parameters.
+        simulated: what their simulator predicts of the training targets, data units.
+        scale: of the residual, normalised.
+        noise_floor: least noise, normalised.
+        residual: state of the second stage.
+    """
 
     phi: Float[Array, " dp"]
     simulated: Float[Array, "m dy"]
+    scale: Float[Array, " dy"]
     noise_floor: Float[Array, " dy"]
     residual: Any
 
@@ -42,7 +51,7 @@ class GreyBox:
     Args:
         sysid: the first stage, which runs before the first step.
         residual: the second one.
-        prior: of the residual, in units of the targets' spread.
+        prior: of the residual; its scale in units of the targets' spread, or `auto`.
     """
 
     sysid: SysID = SysID()
@@ -77,10 +86,9 @@ class GreyBox:
         scale, dtype = problem.normaliser, problem.x.dtype
         bound = self.prior.bind(None, problem.x.shape[1], problem.y.shape[1], jnp.asarray(scale.x_std))
         own = Setting(bound, Gaussian(), setting.sample_inputs)
-        kappa = jnp.full(problem.y.shape[1:], self.prior.scale, dtype)
+        ones, y_std = jnp.ones(problem.y.shape[1:], dtype), jnp.asarray(scale.y_std)
         # what is left has mean zero, not that of the targets
-        unshifted = scale._replace(y_mean=jnp.zeros_like(jnp.asarray(scale.y_mean)))
-        frame = problem._replace(gap_scale=kappa, bank=None, normaliser=unshifted)
+        frame = problem._replace(gap_scale=ones, bank=None, normaliser=scale._replace(y_mean=0 * y_std))
 
         def simulated(phi: Float[Array, " dp"], x: Float[Numbers, "n dx"]) -> Float[Array, "n dy"]:
             """Data units."""
@@ -90,40 +98,54 @@ class GreyBox:
             """Normalised targets of the second stage."""
             return jnp.asarray(problem.y) - (predicted - scale.y_mean[None]) / scale.y_std[None]
 
-        def least_noise(predicted: Float[Array, "m dy"]) -> Float[Array, " dy"]:
-            """The floor that every method has (`NoiseModel.marginal_share`), under the residual's prior."""
-            noise, rows = self.residual.noise, problem.x.shape[0]
-            if not (noise.learn and noise.marginal_share > 0 and rows <= MOST_ROWS):
-                return jnp.asarray(problem.noise_floor)
-            known = bound._replace(white_variance=0.0).covariance(scale.x(problem.x), jnp.ones((1,), dtype))[0]
-            data = spectrum(known, left(predicted), problem.m)
-            sigma, _ = likeliest(data, kappa, self.prior.white_variance, noise, problem.noise_floor, problem.noise_init)
-            most = 0.99 * problem.noise_init
-            return jnp.clip(noise.marginal_share * sigma.astype(dtype), problem.noise_floor, most)
+        def likely(predicted: Float[Array, "m dy"]) -> tuple[Float[Array, " dy"], Float[Array, " dy"]]:
+            """Scale and floor of the noise: what every method has (`NoiseModel.marginal_share`), under the residual's prior."""
+            noise, kappa = self.residual.noise, None
+            if not isinstance(self.prior.scale, str):
+                kappa = self.prior.scale * ones
+            floors = noise.learn and noise.marginal_share > 0 and len(problem.x) <= MOST_ROWS
+            if kappa is not None and not floors:
+                return kappa, jnp.asarray(problem.noise_floor)
+            rows, m = jnp.arange(len(problem.x), dtype=problem.m.dtype), jnp.asarray(problem.m)
+            if len(rows) > MOST_ROWS:  # padding is to powers of two: so many of the data, evenly
+                rows, m = rows[:MOST_ROWS] * m // MOST_ROWS, jnp.minimum(m, MOST_ROWS)
+            known = bound.covariance(scale.x(jnp.asarray(problem.x)[rows]), ones[:1])[0]
+            data = spectrum(known, left(predicted)[rows], m)
+            best = likeliest(data, kappa, 0.0, noise, problem.noise_floor, problem.noise_init)
+            least = noise.raised(
+                problem.noise_floor, noise.marginal_share * best.noise.astype(dtype), problem.noise_init
+            )
+            return best.scale.astype(dtype), jnp.asarray(least if floors else problem.noise_floor)
 
-        def second(predicted: Float[Array, "m dy"], noise_floor: Float[Array, " dy"]) -> Inference:
-            return self.residual.bind(own, frame._replace(y=left(predicted), noise_floor=noise_floor))
+        def second(state: State) -> Inference:
+            own_units = frame._replace(
+                y=left(state.simulated) / state.scale[None],
+                normaliser=frame.normaliser._replace(y_std=y_std * state.scale),
+                noise_init=problem.noise_init / state.scale,
+                noise_floor=state.noise_floor / state.scale,
+            )
+            return self.residual.bind(own, own_units)
 
         def init(key: PRNGKeyArray) -> State:
             key_first, key_second = jax.random.split(key)
             phi = identified(self.sysid, setting, problem, key_first)
             predicted = simulated(phi, problem.x)
-            floor = least_noise(predicted)
-            return State(phi, predicted, floor, second(predicted, floor).init(key_second))
+            first = State(phi, predicted, *likely(predicted), None)
+            return first._replace(residual=second(first).init(key_second))
 
         def draw(key: PRNGKeyArray) -> Any:
             return self.residual.bind(own, frame).draw(key)
 
         def step(key: PRNGKeyArray, state: State, draws: Any) -> tuple[State, Info]:
-            after, info = second(state.simulated, state.noise_floor).step(key, state.residual, draws)
-            return state._replace(residual=after), info
+            after, info = second(state).step(key, state.residual, draws)
+            return state._replace(residual=after), info._replace(noise_std=info.noise_std * state.scale)
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
-            rest = second(state.simulated, state.noise_floor).predict(state.residual, x)
+            rest = second(state).predict(state.residual, x)
             return rest._replace(particles=rest.particles + simulated(state.phi, x)[None])
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
-            rest = second(state.simulated, state.noise_floor).members(state.residual, x)
+            rest = second(state).members(state.residual, x)
             return rest + jax.vmap(lambda x: simulated(state.phi, x))(x)
 
         return Inference(init, draw, step, predict, members)

@@ -1,6 +1,8 @@
-"""Noise of the largest marginal likelihood about a known mean, a Gaussian process integrated out in closed form.
+"""Scale of a Gaussian process and noise of the largest marginal likelihood about a known mean.
 
     y - mean ~ N(0, kappa^2 R + (w + sigma^2) I),    R = V diag(values) V'
+
+In JAX, since the mean is identified there (`gap.py` does the same for a simulator whose parameters are integrated out).
 
 Reference: Rasmussen and Williams (2006), eq. 5.8.
 """
@@ -14,6 +16,8 @@ from jaxtyping import Array, Float, Int
 from simpel_cli.inference import NoiseModel, Numbers
 
 NOISES = 41  # levels that are tried, from the floor to the targets' spread
+SCALES = 1e-3, 10.0, 41  # that are tried: first, last, how many
+TYPICAL_SCALE, SPREAD_OF_SCALES = 0.1, 2.0  # log kappa ~ N(log 0.1, 2^2), which decides where few data do not
 
 
 class Spectrum(NamedTuple):
@@ -26,6 +30,14 @@ class Spectrum(NamedTuple):
     vectors: Float[Array, "m m"]
     turned: Float[Array, "m dy"]
     padding: Float[Array, ""]
+
+
+class Likeliest(NamedTuple):
+    """Per output, normalised: kappa, sigma, and minus the logarithm of the penalised marginal likelihood."""
+
+    scale: Float[Array, " dy"]
+    noise: Float[Array, " dy"]
+    loss: Float[Array, " dy"]
 
 
 def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], rows: Int[Numbers, ""]) -> Spectrum:
@@ -44,38 +56,48 @@ def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], r
 
 def likeliest(
     given: Spectrum,
-    kappa: Float[Numbers, " dy"],
+    kappa: Float[Numbers, " dy"] | None,
     white: float,
     noise: NoiseModel,
     floor: Float[Numbers, " dy"],
     typical: Float[Numbers, " dy"],
-) -> tuple[Float[Array, " dy"], Float[Array, " dy"]]:
-    """Return the noise of every output with the largest penalised marginal likelihood, and minus its logarithm.
+) -> Likeliest:
+    """Return what maximises the penalised marginal likelihood of every output.
 
     Args:
         given: residuals.
-        kappa: scale of the Gaussian process.
+        kappa: scale of the Gaussian process; None: it is chosen, too.
         white: w, its white variance.
         noise: its prior; one that is not learned is `typical`.
         floor: smallest noise.
         typical: its initial value.
     """
+    floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (floor, typical))
+    if kappa is None:
+        scales = jnp.tile(jnp.geomspace(*SCALES)[None], (len(floor), 1))
+        penalty = 0.5 * (jnp.log(scales / TYPICAL_SCALE) / SPREAD_OF_SCALES) ** 2
+    else:
+        scales = jnp.asarray(kappa).astype(jnp.float64)[:, None]
+        penalty = jnp.zeros_like(scales)
 
     def of_output(
-        turned: Float[Array, " m"], kappa: Float[Array, ""], floor: Float[Array, ""], typical: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        turned: Float[Array, " m"],
+        scales: Float[Array, " s"],
+        penalty: Float[Array, " s"],
+        floor: Float[Array, ""],
+        typical: Float[Array, ""],
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         levels = jnp.exp(jnp.linspace(jnp.log(floor), jnp.log(jnp.maximum(1.0, 2 * floor)), NOISES))
         levels = levels if noise.learn else typical[None]
 
-        def minus(sigma: Float[Array, ""]) -> Float[Array, ""]:
-            total = kappa**2 * given.values + sigma**2 + white
+        def minus(scale: Float[Array, ""], penalty: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
+            total = scale**2 * given.values + sigma**2 + white
             empty = given.padding * jnp.log(sigma**2 + white)
             data = 0.5 * jnp.sum(turned**2 / total + jnp.log(total)) - 0.5 * empty
-            return data + 0.5 * (jnp.log(sigma / typical) / noise.prior_std) ** 2
+            return data + penalty + 0.5 * (jnp.log(sigma / typical) / noise.prior_std) ** 2
 
-        losses = jax.vmap(minus)(levels)
-        best = jnp.argmin(losses)
-        return levels[best], losses[best]
+        losses = jax.vmap(lambda s, p: jax.vmap(lambda sigma: minus(s, p, sigma))(levels))(scales, penalty)
+        i, j = jnp.unravel_index(jnp.argmin(losses), losses.shape)
+        return scales[i], levels[j], losses[i, j]
 
-    kappa, floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (kappa, floor, typical))
-    return jax.vmap(of_output, in_axes=(1, 0, 0, 0))(given.turned, kappa, floor, typical)
+    return Likeliest(*jax.vmap(of_output, in_axes=(1, 0, 0, 0, 0))(given.turned, scales, penalty, floor, typical))

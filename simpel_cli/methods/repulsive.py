@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.methods.fsvgd import kernel_between, refuse_bandwidth
+from simpel_cli.methods.fsvgd import between, kernel_between, refuse_bandwidth
 from simpel_cli.methods.function_space import FunctionSpace
 
 
@@ -42,5 +42,4 @@ class Repulsive(FunctionSpace):
         kernel, width_squared = kernel_between(flat, self.bandwidth)
         crowd = jnp.sum(kernel, axis=0)
         push = (crowd[:, None] * flat - kernel.T @ flat) / (width_squared * crowd[:, None])
-        off_diagonal = (jnp.sum(kernel) - n) / max(n * (n - 1), 1)
-        return score + push.reshape(h.shape), off_diagonal
+        return score + push.reshape(h.shape), between(kernel)

@@ -68,17 +68,19 @@ def _learning_curves(path: Path) -> Any:
     if not rows:
         return None
     outputs = distinct(r["output"] for r in rows if r["metric"] == "noise_std")
-    moving = any(r["metric"] == "mean_kernel" and r["value"] > 0 for r in rows)
-    figure, (loss, *apart, noise) = new_figure(2 + moving, beside=len(outputs))
+    kernels = [r["value"] for r in rows if r["metric"] == "mean_kernel"]
+    # constant: the particles do not feel each other, or the kernel's width follows their distance (`median`)
+    told = bool(kernels) and max(kernels) > 1.01 * min(kernels)
+    figure, (loss, *apart, noise) = new_figure(2 + told, beside=len(outputs))
     for i, seed in enumerate(distinct(r["seed"] for r in rows)):
         own = [r for r in rows if r["seed"] == seed]
         curve = [(r["step"], r["value"]) for r in own if r["metric"] == "loss"]
         loss.plot(*zip(*curve, strict=True), color=COLOURS[0], alpha=0.9 if i == 0 else 0.4, linewidth=1)
-        for axis in apart:  # a kernel exp(-d^2/2) of the typical distance d
+        for axis in apart:  # the distance d at which a kernel exp(-d^2/2) has the mean one's value
             widths = [
-                (r["step"], max(-2 * np.log(max(r["value"], 1e-30)), 0.0) ** 0.5)
+                (r["step"], max(-2 * np.log(r["value"]), 0.0) ** 0.5)
                 for r in own
-                if r["metric"] == "mean_kernel"
+                if r["metric"] == "mean_kernel" and r["value"] > 0
             ]
             axis.plot(*zip(*widths, strict=True), color=COLOURS[0], alpha=0.9 if i == 0 else 0.4, linewidth=1)
         for j, output in enumerate(outputs):

@@ -6,7 +6,10 @@ from collections.abc import Callable
 import jax
 from jaxtyping import Array, Float
 
-Score = Callable[[Float[Array, "L M"]], Float[Array, "L M"]]  # a tree of arrays, so that many can be stacked
+from simpel_cli.errors import ConfigError
+
+# a jax.tree_util.Partial: its arrays are a tree, so that those of many sets and outputs can be stacked
+Score = Callable[[Float[Array, "L M"]], Float[Array, "L M"]]
 
 
 class Estimator(ABC):
@@ -21,7 +24,7 @@ class Estimator(ABC):
         covariance: Float[Array, "M M"],
         gap: Float[Array, "N M"] | None = None,
     ) -> Score:
-        """Return the score; all work that function values have no part in is done here.
+        """Return the score as a `jax.tree_util.Partial`; all work that function values have no part in is done here.
 
         Args:
             samples: draws of the simulator's part of the prior.
@@ -46,9 +49,19 @@ def fitted(
     covariance: Float[Array, "M M"],
     gap: Float[Array, "N M"] | None,
 ) -> Score:
-    """Return the score of an estimator; one of a user's that can only be called keeps its draws."""
-    if isinstance(estimator, Estimator):
-        return estimator.fitted(samples, covariance, gap)
+    """Return the score of an estimator; one of a user's with a `__call__` of its own keeps its draws, and is called.
+
+    Raises:
+        ConfigError: `fitted` returns something else than a `jax.tree_util.Partial`.
+    """
+    if isinstance(estimator, Estimator) and type(estimator).__call__ is Estimator.__call__:
+        score = estimator.fitted(samples, covariance, gap)
+        if not isinstance(score, jax.tree_util.Partial):
+            raise ConfigError(
+                f"score: {type(estimator).__name__}.fitted returned a {type(score).__name__}; it must return a "
+                "jax.tree_util.Partial of a function and arrays, so that those of many sets of points can be stacked."
+            )
+        return score
     return jax.tree_util.Partial(_called, jax.tree_util.Partial(estimator), samples, covariance, gap)
 
 

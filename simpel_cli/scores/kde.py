@@ -59,7 +59,8 @@ class KDE(Estimator):
         factor = jnp.linalg.cholesky(b2 * spread + known)
         to_white = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(mean), dtype=factor.dtype), lower=True)
         shrunk = jnp.sqrt(1 - b2) * (samples - mean[None]).astype(spread.dtype)
-        return jax.tree_util.Partial(_pull, mean, to_white, shrunk @ to_white.T)
+        # many draws, of size 1: they need no more digits than the samples have
+        return jax.tree_util.Partial(_pull, mean, to_white, (shrunk @ to_white.T).astype(samples.dtype))
 
     def _squared(self, n: int, spread: Float[Array, "M M"], known: Float[Array, "M M"]) -> Float[Array, ""]:
         if not isinstance(self.bandwidth, str):
@@ -77,6 +78,6 @@ def _pull(
     mean: Float[Array, " M"], to_white: Float[Array, "M M"], centres: Float[Array, "N M"], h: Float[Array, "L M"]
 ) -> Float[Array, "L M"]:
     """Return where the mixture of white Gaussians about the centres is denser."""
-    here = (h - mean[None]).astype(to_white.dtype) @ to_white.T
+    here = ((h - mean[None]).astype(to_white.dtype) @ to_white.T).astype(centres.dtype)
     weight = jax.nn.softmax(-squared_distances(here, centres) / 2, axis=1)
-    return ((weight @ centres - here) @ to_white).astype(h.dtype)
+    return ((weight @ centres - here).astype(to_white.dtype) @ to_white).astype(h.dtype)

@@ -62,7 +62,7 @@ class NuMethod(Estimator):
 
     kernel: str = "imq"
     bandwidth: float | str = "median"
-    wider: float = 4.0
+    wider: float = 2.0
     regularisation: str = "nu"
     weight: float = 1e-3
     nu: float = 1.0
