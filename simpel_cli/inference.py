@@ -186,9 +186,10 @@ class NoiseModel:
         measured_share: nor does it fall below this share of the measurement noise that the data YAML declares. 0.7 is the
             sine's or cosine's share of an angle's noise. (An estimate from the data is an upper bound, hence no floor.)
         marginal_share: nor, where it is learned from no more than 512 transitions (128 of a world), below this share of
-            the noise with the largest marginal likelihood under the method's prior, or the initial value if that
-            is less. A network that goes through every one of a few points would else learn that there is no noise; where
-            all functions that the prior allows are integrated out, it cannot. 0 switches that off.
+            the noise with the largest marginal likelihood under the method's prior, or the initial value if that is less;
+            of a prior without a simulator, whose lengthscale may be short, not below what a smooth function leaves either
+            (`likeliest.py`). A network that goes through every one of a few points would else learn that there is no
+            noise; where all functions that the prior allows are integrated out, it cannot. 0 switches that off.
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.
         rate: its learning rate as a multiple of the networks'. One number per output has far less to learn than a

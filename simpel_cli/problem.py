@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from simpel_cli.blow_up import blown_up
 from simpel_cli.domain import Domain
@@ -18,6 +18,7 @@ from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.likeliest import noise_of_smooth
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
 from simpel_cli.transition import Transition, encoding_of, transition
 from simulators.model import Model
@@ -269,7 +270,13 @@ def _scales(
     if prior.uses_simulator:
         samples = (system.simulate(key, here, SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
     normalised = (here - normaliser.x_mean) / normaliser.x_std
-    correlation = np.asarray(bound._replace(white_variance=0.0).covariance(jnp.asarray(normalised), jnp.ones(size))[0])
+
+    def stretched(longer: float) -> Array:
+        """Correlation per output of a lengthscale so many times the declared one."""
+        other = bound._replace(white_variance=0.0, input_scale=np.asarray(bound.input_scale) / longer)
+        return other.covariance(jnp.asarray(normalised), jnp.ones(size))
+
+    correlation = np.asarray(stretched(1.0)[0])
     chosen = [
         marginal_likelihood_scales(
             samples[:, :, i], correlation, targets[subset, i], noise_init[i], prior.white_variance,
@@ -278,4 +285,10 @@ def _scales(
         for i in range(size)
     ]  # fmt: skip
     scale, sigma = (np.array(values) for values in zip(*chosen, strict=True))
+    if with_noise and not prior.uses_simulator:
+        smooth = np.asarray(noise_of_smooth(
+            lambda longer: stretched(longer)[0], targets[subset], np.array(len(here), np.int32), prior.white_variance, 1.0,
+            np.full(size, 1e-3), noise_init,
+        ))  # fmt: skip
+        sigma = np.maximum(sigma, smooth)
     return scale, sigma if with_noise else np.zeros(size)

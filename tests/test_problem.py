@@ -11,6 +11,7 @@ from scipy import stats
 from simpel_cli.errors import ConfigError
 from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import NoiseModel, padded_length
+from simpel_cli.likeliest import likeliest, noise_of_smooth, spectrum
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.problem import (
     SCALE_DRAWS,
@@ -258,6 +259,27 @@ def test_a_world_is_asked_for_the_scales_at_few_points_and_for_a_gp_not_at_all(p
     assert (WORLD_SCALE_POINTS * SCALE_DRAWS in sizes) == asked
     assert (float(problems.noise_floor[0, 0]) > 1.1e-3) == (not asked)  # 300 rows: more than a world is asked at
     assert 0.01 < float(problems.gap_scale[0, 0]) < 10
+
+
+def test_a_short_lengthscale_in_many_dimensions_does_not_hide_the_noise():
+    """Every row is far from every other by it, so that its marginal likelihood says nothing: longer ones do."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1.7, 1.7, (200, 4))
+    y = np.stack([np.sin(x.sum(axis=1)), 0.3 * x[:, 0]], axis=1) + [0.2, 0.02] * rng.normal(size=(200, 2))
+    asked = []
+
+    def correlation(longer):
+        asked.append(longer)
+        squared = ((x[:, None] - x[None]) ** 2).sum(axis=-1)
+        return jnp.asarray(np.exp(-squared / (2 * (0.2 * longer) ** 2)))
+
+    given = np.array(200, np.int32), 1e-6, 1.0, np.full(2, 1e-3), np.full(2, 0.1)
+    found = noise_of_smooth(correlation, y, *given)
+    np.testing.assert_allclose(found, [0.2, 0.02], rtol=0.25)
+    assert asked[0] == 1.0
+    assert len(set(asked)) == len(asked)
+    own = likeliest(spectrum(correlation(1.0), jnp.asarray(y), given[0]), None, *given[1:]).noise
+    assert (np.abs(np.log(np.asarray(own) / [0.2, 0.02])) > np.log(1.4)).any()
 
 
 @pytest.mark.parametrize("gap", [None, 0.2])

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.errors import ConfigError
 from simpel_cli.gp import gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
-from simpel_cli.methods.likeliest_noise import Spectrum, likeliest, spectrum
+from simpel_cli.likeliest import Spectrum, likeliest, spectrum
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.predictive import Predictive
 
@@ -86,7 +86,8 @@ class ExactGP:
             known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = spectrum(gram(kernel, known, known), left, problem.m)
-            best = likeliest(data, kappa, prior.white_variance, self.noise, problem.noise_floor, problem.noise_init)
+            prior_std = self.noise.prior_std if self.noise.learn else None
+            best = likeliest(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
             return State(phi, data, best.noise.astype(dtype), (jnp.sum(best.loss) / jnp.sum(counts)).astype(dtype))
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:

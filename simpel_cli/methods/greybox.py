@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.likeliest import likeliest, noise_of_smooth, spectrum
 from simpel_cli.methods.fsvgd import FSVGD
-from simpel_cli.methods.likeliest_noise import likeliest, spectrum
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.predictive import Predictive
 from simpel_cli.prior import GPPrior
@@ -109,13 +109,20 @@ class GreyBox:
             rows, m = jnp.arange(len(problem.x), dtype=problem.m.dtype), jnp.asarray(problem.m)
             if len(rows) > MOST_ROWS:  # padding is to powers of two: so many of the data, evenly
                 rows, m = rows[:MOST_ROWS] * m // MOST_ROWS, jnp.minimum(m, MOST_ROWS)
-            known = bound.covariance(scale.x(jnp.asarray(problem.x)[rows]), ones[:1])[0]
-            data = spectrum(known, left(predicted)[rows], m)
-            best = likeliest(data, kappa, 0.0, noise, problem.noise_floor, problem.noise_init)
-            least = noise.raised(
-                problem.noise_floor, noise.marginal_share * best.noise.astype(dtype), problem.noise_init
-            )
-            return best.scale.astype(dtype), jnp.asarray(least if floors else problem.noise_floor)
+            x, y = scale.x(jnp.asarray(problem.x)[rows]), left(predicted)[rows]
+            init, floor = problem.noise_init, problem.noise_floor
+
+            def correlation(longer: float) -> Float[Array, "m m"]:
+                stretched = bound._replace(input_scale=jnp.asarray(bound.input_scale) / longer)
+                return stretched.covariance(x, ones[:1])[0]
+
+            prior_std = noise.prior_std if noise.learn else None
+            best = likeliest(spectrum(correlation(1.0), y, m), kappa, 0.0, prior_std, floor, init)
+            if not floors:
+                return best.scale.astype(dtype), jnp.asarray(floor)
+            sigma = jnp.maximum(best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init))
+            least = noise.raised(floor, noise.marginal_share * sigma.astype(dtype), init)
+            return best.scale.astype(dtype), jnp.asarray(least)
 
         def second(state: State) -> Inference:
             own_units = frame._replace(

@@ -7,15 +7,17 @@ In JAX, since the mean is identified there (`gap.py` does the same for a simulat
 Reference: Rasmussen and Williams (2006), eq. 5.8.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from simpel_cli.inference import NoiseModel, Numbers
-
+Numbers = Array | np.ndarray
 NOISES = 41  # levels that are tried, from the floor to the targets' spread
+LONGER = 1.0, 2.0, 4.0, 8.0, 16.0  # lengthscales that are tried, over the declared one
 SCALES = 1e-3, 10.0, 41  # that are tried: first, last, how many
 TYPICAL_SCALE, SPREAD_OF_SCALES = 0.1, 2.0  # log kappa ~ N(log 0.1, 2^2), which decides where few data do not
 
@@ -58,7 +60,7 @@ def likeliest(
     given: Spectrum,
     kappa: Float[Numbers, " dy"] | None,
     white: float,
-    noise: NoiseModel,
+    prior_std: float | None,
     floor: Float[Numbers, " dy"],
     typical: Float[Numbers, " dy"],
 ) -> Likeliest:
@@ -68,9 +70,9 @@ def likeliest(
         given: residuals.
         kappa: scale of the Gaussian process; None: it is chosen, too.
         white: w, its white variance.
-        noise: its prior; one that is not learned is `typical`.
+        prior_std: log sigma ~ N(log typical, prior_std^2); None: sigma is `typical`.
         floor: smallest noise.
-        typical: its initial value.
+        typical: see `prior_std`.
     """
     floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (floor, typical))
     if kappa is None:
@@ -88,16 +90,47 @@ def likeliest(
         typical: Float[Array, ""],
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         levels = jnp.exp(jnp.linspace(jnp.log(floor), jnp.log(jnp.maximum(1.0, 2 * floor)), NOISES))
-        levels = levels if noise.learn else typical[None]
+        levels = levels if prior_std is not None else typical[None]
 
         def minus(scale: Float[Array, ""], penalty: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
             total = scale**2 * given.values + sigma**2 + white
             empty = given.padding * jnp.log(sigma**2 + white)
             data = 0.5 * jnp.sum(turned**2 / total + jnp.log(total)) - 0.5 * empty
-            return data + penalty + 0.5 * (jnp.log(sigma / typical) / noise.prior_std) ** 2
+            return data + penalty + 0.5 * (jnp.log(sigma / typical) / (prior_std or 1.0)) ** 2
 
         losses = jax.vmap(lambda s, p: jax.vmap(lambda sigma: minus(s, p, sigma))(levels))(scales, penalty)
         i, j = jnp.unravel_index(jnp.argmin(losses), losses.shape)
         return scales[i], levels[j], losses[i, j]
 
     return Likeliest(*jax.vmap(of_output, in_axes=(1, 0, 0, 0, 0))(given.turned, scales, penalty, floor, typical))
+
+
+def noise_of_smooth(
+    correlation: Callable[[float], Float[Array, "m m"]],
+    residual: Float[Numbers, "m dy"],
+    rows: Int[Numbers, ""],
+    white: float,
+    prior_std: float,
+    floor: Float[Numbers, " dy"],
+    typical: Float[Numbers, " dy"],
+) -> Float[Array, " dy"]:
+    """Return what a smooth function leaves of the residuals, where neither its size nor its lengthscale is known.
+
+    Where the declared lengthscale is short and the inputs have many dimensions no two rows tell of each other, and the
+    marginal likelihood says nothing of the noise: longer ones are tried.
+
+    Args:
+        correlation: at the padded inputs, of a lengthscale so many times the declared one.
+        residual: of their targets.
+        rows: number of data; see `spectrum`.
+        white: w.
+        prior_std: of log sigma; see `likeliest`.
+        floor: smallest noise.
+        typical: its typical value.
+    """
+    found = [
+        likeliest(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
+        for f in LONGER
+    ]
+    noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))
+    return jnp.take_along_axis(noise, jnp.argmin(loss, axis=0)[None], axis=0)[0]
