@@ -8,6 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
+import simpel_cli  # noqa: F401  sets XLA's flags before JAX opens its backend
+
 ROOT = Path(__file__).parents[1]
 LONGEST = (
     "wrong_inputs", "cli", "discover", "resume", "discovery_filter", "methods", "own_data", "recorded_systems", "scores",
