@@ -17,7 +17,7 @@ CACHE = ROOT / ".pytest_cache" / "cache"  # compiled programs are shared by all 
 PATIENCE = 1800.0  # s for a process that hangs; a loaded machine is no failure
 TINY = (
     "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64",
-    "run.quiet=true", "run.figures=false",
+    "run.figures=false", "run.quiet=true",
 )  # fmt: skip
 FIT = ("fit", "experiment=pendulum", *TINY)
 

@@ -21,7 +21,7 @@ def test_conjugate_gradients_are_right_however_they_are_compiled() -> None:
 
     def solve(x: jax.Array, a: jax.Array, b: jax.Array, right: jax.Array, k: int) -> jax.Array:
         found = jax.scipy.sparse.linalg.cg(lambda c: operator(x, a, b, c), right, tol=1e-10, maxiter=500)[0]
-        return found + 0 * k
+        return found + 1e-12 * k  # reaches the program: every k is compiled anew
 
     right = operator(*given, jnp.asarray(wanted))
     for k in range(12):

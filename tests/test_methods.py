@@ -204,20 +204,20 @@ def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual
 @pytest.mark.parametrize("wave", [0.0, 0.02, 0.5])
 def test_the_scale_of_what_greybox_learns_is_what_the_simulator_leaves(wave: float) -> None:
     x = np.random.default_rng(3).uniform(-EDGE, EDGE, (100, 1))
-    y = 1.3 * x - 0.4 + wave * np.sin(3 * x) + 1e-3 * np.random.default_rng(4).normal(size=x.shape)
+    y = 1.3 * x - 0.4 + wave * np.sin(3 * x) + 0.01 * np.random.default_rng(4).normal(size=x.shape)
     method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, **FEW), GPPrior(lengthscale=0.7, scale="auto"))
     rule = method.bind(setting_of(prior_of()), problem_of(y, x=x))
     state = rule.init(jax.random.key(0))
-    assert 0.3 * wave <= float(state.scale[0]) <= max(2 * wave, 3e-3)
-    assert 0.5e-3 < float(state.noise_floor[0]) < 2e-3  # that of the problem is 0.001
+    assert 0.3 * wave <= float(state.scale[0]) <= max(2 * wave, 0.01)
+    assert 0.007 < float(state.noise_floor[0]) < 0.014  # that of the problem is 0.001
     _, info = rule.step(jax.random.key(1), state, rule.draw(jax.random.key(2)))
     np.testing.assert_allclose(info.noise_std, NOISE, rtol=1e-3)  # in the units of the targets
     close = jax.tree.map(lambda a: 0 * a, state.residual.particles)
     nothing = rule.predict(state._replace(residual=state.residual._replace(particles=close)), jnp.asarray(x))
     np.testing.assert_allclose(nothing.noise_std, NOISE, rtol=1e-3)
-    assert np.std(np.asarray(nothing.mean) - y) < 0.8 * wave + 2e-3  # the identified line alone
+    assert np.std(np.asarray(nothing.mean) - y) < 0.8 * wave + 0.02  # the identified line alone
     one = rule.predict(state, jnp.asarray(x)).particles - nothing.particles
-    assert np.std(np.asarray(one)) < 3 * float(state.scale[0])
+    assert np.std(np.asarray(one)) < 3 * float(state.scale[0]) + 1e-3
 
 
 def test_greybox_of_many_rows_looks_at_some_of_all_of_them() -> None:

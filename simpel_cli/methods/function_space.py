@@ -30,7 +30,7 @@ from simpel_cli.nets import MLP
 from simpel_cli.scores.estimator import Score, fitted
 from simpel_cli.scores.gaussian import moments
 
-MOST_SETS = 512  # of a stretch, where there are many data
+MOST_SETS = 256  # of a stretch, where there are many data: an estimate that keeps its draws takes a megabyte per set
 LEAST_DRAWS = 256  # that an estimator gets which works on draws of the whole prior
 
 
@@ -67,7 +67,7 @@ class FunctionSpace(ABC):
         batch: training points per step, at most; drawn without replacement.
         fresh_points: points of the domain per step.
         pool: points of the domain that a stretch of steps chooses from; a power of two.
-        sets: measurement sets that a stretch of steps chooses from, at least; more, up to 512, where so many batches are not
+        sets: measurement sets that a stretch of steps chooses from, at least; more, up to 256, where so many batches are not
             as many as the data.
         prior_weight: exponent of the prior; 1 is Bayes.
         precondition: go in Newton's direction of the function values (`preconditioner.py`): for rules whose particles climb

@@ -84,7 +84,10 @@ class GreyBox:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
         _, run = simulator_of(setting)
         scale, dtype = problem.normaliser, problem.x.dtype
-        bound = self.prior.bind(None, problem.x.shape[1], problem.y.shape[1], jnp.asarray(scale.x_std))
+        # of a residual that is scaled to 1
+        relative = 1.0 if isinstance(self.prior.scale, str) else self.prior.scale**2
+        own_prior = replace(self.prior, white_variance=self.prior.white_variance / relative)
+        bound = own_prior.bind(None, problem.x.shape[1], problem.y.shape[1], jnp.asarray(scale.x_std))
         own = Setting(bound, Gaussian(), setting.sample_inputs)
         ones, y_std = jnp.ones(problem.y.shape[1:], dtype), jnp.asarray(scale.y_std)
         # what is left has mean zero, not that of the targets

@@ -69,8 +69,8 @@ def _learning_curves(path: Path) -> Any:
         return None
     outputs = distinct(r["output"] for r in rows if r["metric"] == "noise_std")
     kernels = [r["value"] for r in rows if r["metric"] == "mean_kernel"]
-    # constant: the particles do not feel each other, or the kernel's width follows their distance (`median`)
-    told = bool(kernels) and max(kernels) > 1.01 * min(kernels)
+    # all but constant: the particles do not feel each other, or the kernel's width follows their distance (`median`)
+    told = bool(kernels) and max(kernels) > 1.2 * min(kernels)
     figure, (loss, *apart, noise) = new_figure(2 + told, beside=len(outputs))
     for i, seed in enumerate(distinct(r["seed"] for r in rows)):
         own = [r for r in rows if r["seed"] == seed]
