@@ -205,7 +205,9 @@ def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual
 def test_the_scale_of_what_greybox_learns_is_what_the_simulator_leaves(wave: float) -> None:
     x = np.random.default_rng(3).uniform(-EDGE, EDGE, (100, 1))
     y = 1.3 * x - 0.4 + wave * np.sin(3 * x) + 0.01 * np.random.default_rng(4).normal(size=x.shape)
-    method = GreyBox(SysID(steps=60, noise=FIXED), FSVGD(steps=1, **FEW), GPPrior(lengthscale=0.7, scale="auto"))
+    method = GreyBox(
+        SysID(steps=60, noise=FIXED), FSVGD(steps=1, **FEW), GPPrior(lengthscale=0.7, scale="auto", white_variance=1e-6)
+    )
     rule = method.bind(setting_of(prior_of()), problem_of(y, x=x))
     state = rule.init(jax.random.key(0))
     assert 0.3 * wave <= float(state.scale[0]) <= max(2 * wave, 0.01)
