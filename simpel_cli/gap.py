@@ -14,7 +14,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize, minimize_scalar
 
 BOUNDS = float(np.log(1e-3)), float(np.log(10.0))  # of log kappa and log sigma
-FEW = 128  # rows, of which a second start costs little
 LEVELS = 41
 
 
@@ -63,7 +62,9 @@ def marginal_likelihood_scales(
         off = theta - np.log([0.1, noise_init])
         return fit + off @ (off / [8, 2]), np.array([along_gap, along_noise]) + off / [4, 1]
 
-    starts = [np.log([kappa, noise_init]) for kappa in ((0.03, 0.3) if len(targets) <= FEW else (0.1,))]
+    starts = [
+        np.log([kappa, noise_init]) for kappa in (0.03, 0.3)
+    ]  # a small gap and much noise, or the other way round
     found = (minimize(objective, s, bounds=[BOUNDS, BOUNDS], method="L-BFGS-B", jac=True) for s in starts)
     kappa, sigma = (float(v) for v in np.exp(min(found, key=lambda r: r.fun).x))
     return Scales(kappa, sigma)
