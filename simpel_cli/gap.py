@@ -62,9 +62,8 @@ def marginal_likelihood_scales(
         off = theta - np.log([0.1, noise_init])
         return fit + off @ (off / [8, 2]), np.array([along_gap, along_noise]) + off / [4, 1]
 
-    starts = [
-        np.log([kappa, noise_init]) for kappa in (0.03, 0.3)
-    ]  # a small gap and much noise, or the other way round
+    # a small gap and much noise, or the other way round: there may be an optimum of each kind
+    starts = [np.log([kappa, noise_init]) for kappa in (0.03, 0.3)]
     found = (minimize(objective, s, bounds=[BOUNDS, BOUNDS], method="L-BFGS-B", jac=True) for s in starts)
     kappa, sigma = (float(v) for v in np.exp(min(found, key=lambda r: r.fun).x))
     return Scales(kappa, sigma)
