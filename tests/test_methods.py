@@ -430,3 +430,15 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
 def test_wrong_settings_are_named(make: Any, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make()
+
+
+def test_many_data_get_more_sets_than_few() -> None:
+    """A stretch that chose among the same few batches would not see most of the rows."""
+
+    def count(rows: int) -> int:
+        x = np.linspace(-EDGE, EDGE, rows)[:, None]
+        method = FSVGD(particles=2, network=MLP((4,)), batch=4, fresh_points=4, pool=16, sets=3)
+        rule = method.bind(setting_of(prior_of()), problem_of(x, x=x))
+        return len(jax.eval_shape(rule.draw, jax.random.key(0)).x)
+
+    assert [count(n) for n in (8, 60, 5000)] == [8, 16, 256]  # rows are padded to 32, 64, 8192

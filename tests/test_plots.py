@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from simpel_cli.plots import run
-from simpel_cli.records import write_metrics, write_table
+from simpel_cli.records import read_metrics, write_metrics, write_table
 
 MANY = tuple(f"position_of_joint_{i}" for i in range(15))
 LEVELS = np.arange(0.05, 0.951, 0.05)
@@ -135,3 +135,19 @@ def test_tables_of_a_run_are_drawn(tmp_path: Path) -> None:
     assert [p.stem for p in drawn] == ["learning_curves", "predictions", "calibration", "free_run", "free_run_example"]
     assert all(p.read_bytes().startswith(b"\x89PNG") for p in drawn)
     assert pq.read_table(tmp_path / "trajectories.parquet").num_rows == 60
+
+
+@pytest.mark.parametrize(("kernels", "panels"), [([0.2, 0.6, 0.9], 3), ([0.5, 0.501, 0.5], 2), ([0.0, 0.0, 0.0], 2)])
+def test_distance_between_particles_is_drawn_where_the_kernel_tells_it(
+    tmp_path: Path, kernels: list[float], panels: int
+) -> None:
+    path = metrics(tmp_path, ("a",))
+    rows = [r for r in read_metrics(path) if r["metric"] != "mean_kernel"]
+    like = next(r for r in rows if r["metric"] == "loss")
+    steps = [r["step"] for r in rows if r["metric"] == "loss" and r["seed"] == like["seed"]][:3]
+    between = [like | {"metric": "mean_kernel", "step": s, "value": k} for s, k in zip(steps, kernels, strict=True)]
+    figure = run._learning_curves(write_metrics(path, rows + between, {}))
+    assert len(figure.axes) == panels
+    if panels == 3:
+        drawn = figure.axes[1].lines[0].get_ydata()
+        np.testing.assert_allclose(np.exp(-(np.asarray(drawn) ** 2) / 2), kernels, rtol=1e-9)
