@@ -26,12 +26,13 @@ def rk4(derivative: Callable[[State], State], x: State, dt: float, substeps: int
     Reference: Kutta (1901).
     """
     h = dt / substeps
+    return jax.lax.scan(lambda x, _: (rk4_step(derivative, x, h), None), x, None, length=substeps)[0]
 
-    def step(x: State, _: None) -> tuple[State, None]:
-        k1 = derivative(x)
-        k2 = derivative(x + h / 2 * k1)
-        k3 = derivative(x + h / 2 * k2)
-        k4 = derivative(x + h * k3)
-        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
-    return jax.lax.scan(step, x, None, length=substeps)[0]
+def rk4_step(derivative: Callable[[State], State], x: State, h: float) -> State:
+    """Make one classical Runge-Kutta step of length h, s."""
+    k1 = derivative(x)
+    k2 = derivative(x + h / 2 * k1)
+    k3 = derivative(x + h / 2 * k2)
+    k4 = derivative(x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

@@ -6,14 +6,16 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import casadi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from simpel_cli.casadi_jax import checked
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.integrate import State, rk4
+from simpel_cli.integrate import State, rk4_step
 from simpel_cli.signals import arriving
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
@@ -49,7 +51,9 @@ def transition(model: Model, encoding: Encoding) -> Transition:
         ConversionError: an operation is not supported, or JAX and CasADi disagree.
     """
     ranges = [[(q.low, q.high) for q in group] for group in (model.states, model.inputs, model.params)]
-    right_hand_side = checked(model.function(), ranges)
+    # outputs are read off the whole function; a transition is integrated in the model's own coordinates
+    measure = checked(model.function(), ranges) if encoding.outputs or not model.states else None
+    integrated = _integrated(model, ranges) if model.states else None
     n_inputs = len(model.inputs)
     rows = [[q.name for q in model.outputs].index(q.name) for q in encoding.outputs]
 
@@ -59,7 +63,7 @@ def transition(model: Model, encoding: Encoding) -> Transition:
             f"data.stack_actions: {encoding.stack}, but inputs of {model.name} act up to {model.memory():.3g} s later: a "
             f"transition needs the {needed:.0f} inputs before its own. Use data.stack_actions={needed:.0f}."
         )
-    params, h = [q.name for q in model.params], model.dt / model.substeps
+    params = [q.name for q in model.params]
 
     def seconds(times: dict[str, float | str], phi: Float[Array, " dp"]) -> Float[Array, " du"]:
         values = {**model.fixed, **{name: phi[i] for i, name in enumerate(params)}}
@@ -68,23 +72,58 @@ def transition(model: Model, encoding: Encoding) -> Transition:
 
     def follow(state: State, stacked: Float[Array, " su"], phi: Float[Array, " dp"]) -> State:
         u = stacked[stacked.shape[0] - n_inputs :]
+        assert integrated is not None
         if not (model.delay or model.lag):
-            return rk4(lambda s: right_hand_side(s, u, phi)[0], state, model.dt, model.substeps)
+            return integrated(state, jnp.broadcast_to(u, (model.substeps, n_inputs)), phi)
         late = arriving(
             stacked.reshape(encoding.stack + 1, n_inputs), seconds(model.delay, phi), seconds(model.lag, phi),
             dt=model.dt, substeps=model.substeps, lead=encoding.stack,
         )  # fmt: skip
 
-        def one(state: State, u: Float[Array, " du"]) -> tuple[State, None]:
-            return rk4(lambda s: right_hand_side(s, u, phi)[0], state, h, 1), None
-
-        return jax.lax.scan(one, state, late[0])[0]
+        return integrated(state, late[0], phi)
 
     def step(x: Float[Array, " dx"], phi: Float[Array, " dp"]) -> Float[Array, " dy"]:
         state, stacked = encoding.split_x(x)
         u = stacked[stacked.shape[0] - n_inputs :]
-        outputs = right_hand_side(state, u, phi)[1][jnp.array(rows, int)] if rows else state[:0]
+        outputs = measure(state, u, phi)[1][jnp.array(rows, int)] if measure is not None and rows else state[:0]
         after = follow(state, stacked, phi) if model.states else state
         return encoding.to_y(state, after, outputs)
 
     return Transition(encoding, model.params, model.gap, step)
+
+
+def _integrated(
+    model: Model, ranges: list[list[tuple[float, float]]]
+) -> Callable[[State, Float[Array, "substeps du"], Float[Array, " dp"]], State]:
+    """Return the map (state, inputs of the substeps, phi) -> state dt later, checked against CasADi."""
+    flow, h = model.flow(), model.dt / model.substeps
+    states, inputs, params = ranges
+    enter, leave, where = None, None, states
+    if flow.enter is not None and flow.leave is not None:
+        where = _reached(flow.enter, states, params)
+        enter, leave = checked(flow.enter, [states, params]), checked(flow.leave, [where, params])
+    rhs = checked(flow.rhs, [where, inputs, params])
+
+    def integrated(state: State, u: Float[Array, "substeps du"], phi: Float[Array, " dp"]) -> State:
+        low, high = (jnp.array(ends, state.dtype) for ends in (flow.low, flow.high))
+
+        def one(z: State, u: Float[Array, " du"]) -> tuple[State, None]:
+            after = rk4_step(lambda z: rhs(z, u, phi)[0], z, h)
+            return jnp.clip(after, low, high) if flow.limited else after, None
+
+        z = enter(state, phi)[0] if enter is not None else state
+        z = jax.lax.scan(one, z, u)[0]
+        return leave(z, phi)[0] if leave is not None else z
+
+    return integrated
+
+
+def _reached(
+    enter: casadi.Function, states: list[tuple[float, float]], params: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Return the box of a model's own coordinates that its declared ranges reach."""
+    random = np.random.default_rng(0)
+    boxes = [np.array(box, float).reshape(-1, 2) for box in (states, params)]
+    points = [casadi.DM(random.uniform(box[:, 0], box[:, 1], (64, len(box))).T) for box in boxes]
+    values = np.asarray(enter.map(64)(*points))
+    return list(zip(values.min(axis=1).tolist(), values.max(axis=1).tolist(), strict=True))

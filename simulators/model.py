@@ -7,37 +7,78 @@
 
 import keyword
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, did_you_mean, parse, symbols_used
+from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, symbols_used
+from simulators.quantity import (
+    LIMITS,
+    TIMES,
+    ModelError,
+    Quantity,
+    check_keys,
+    check_mapping,
+    read_expression,
+    read_limits,
+    read_number,
+    read_output,
+    read_term,
+    read_times,
+    read_uncertain,
+    read_unit,
+    read_variable,
+    refuse_unknown,
+)
 
-PRIORS = ("uniform", "normal", "lognormal")
-TIMES = ("delay", "lag")  # of an input
+__all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
+
+UNLIMITED = (-math.inf, math.inf)
 
 
-class ModelError(ValueError):
-    """What a user declared wrong: the key path, what was given, what is allowed and the cure."""
+class Coordinates(NamedTuple):
+    """Coordinates z in which a transition is integrated, where these are not the states themselves.
 
+    Args:
+        size: rows of z.
+        enter: (x, p) -> z.
+        rhs: (z, u, p) -> dz/dt.
+        leave: (z, p) -> x.
+        limits: lowest and highest value of every row of z, to which it is clipped after each Runge-Kutta step.
 
-class Quantity(NamedTuple):
-    """One named number of a model.
-
-    `prior` matters for parameters only. For `normal` (`lognormal`: of the logarithm) the range is the interval of +-2
-    standard deviations, mean = (low + high)/2 and sd = (high - low)/4, and nothing is cut off at its ends.
-    An empty `unit` means that none was stated. Outputs have no range: low = high = nan.
     """
 
-    name: str
-    unit: str
-    low: float
-    high: float
-    periodic: bool = False
-    prior: str = "uniform"
+    size: int
+    enter: Callable[[Symbol, Symbol], Symbol]
+    rhs: Callable[[Symbol, Symbol, Symbol], Symbol]
+    leave: Callable[[Symbol, Symbol], Symbol]
+    limits: tuple[float, float] = UNLIMITED
+
+
+class Flow(NamedTuple):
+    """What an integrator of a model needs.
+
+    Args:
+        enter: CasADi function (x, p) -> z; None: z = x.
+        rhs: CasADi function (z, u, p) -> dz/dt.
+        leave: CasADi function (z, p) -> x; None: x = z.
+        low, high: per row of z, to which it is clipped after each Runge-Kutta step; infinite where nothing limits it.
+
+    """
+
+    enter: casadi.Function | None
+    rhs: casadi.Function
+    leave: casadi.Function | None
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @property
+    def limited(self) -> bool:
+        """Whether anything is clipped."""
+        return any(math.isfinite(end) for end in (*self.low, *self.high))
 
 
 @dataclass(frozen=True)
@@ -58,6 +99,8 @@ class Model:
         fixed: the known numbers by name, for the reader and for reports.
         delay: input: how much later it acts than it is recorded, s, or the parameter that says so.
         lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
+        limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
+        coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
     """
@@ -75,6 +118,8 @@ class Model:
     fixed: dict[str, float] = field(default_factory=dict)
     delay: dict[str, float | str] = field(default_factory=dict)
     lag: dict[str, float | str] = field(default_factory=dict)
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
 
     def memory(self) -> float:
@@ -101,6 +146,27 @@ class Model:
                 )
         return casadi.Function(self.name, arguments, [value for value, _ in results.values()], [*groups], [*results])
 
+    def flow(self) -> Flow:
+        """Return what integrates one transition: in the states, or in coordinates of the model's own."""
+        x, u, p = (self.symbol.sym(n, len(g), 1) for n, g in zip("xup", self._groups, strict=True))
+        own = self.coordinates
+        if own is None:
+            rhs = casadi.Function(f"{self.name}_rhs", [x, u, p], [self.rhs(x, u, p)], ["x", "u", "p"], ["dx"])
+            low, high = zip(*(self.limits.get(q.name, UNLIMITED) for q in self.states), strict=True)
+            return Flow(None, rhs, None, low, high)
+        z = self.symbol.sym("z", own.size, 1)
+        return Flow(
+            casadi.Function(f"{self.name}_enter", [x, p], [own.enter(x, p)], ["x", "p"], ["z"]),
+            casadi.Function(f"{self.name}_rhs", [z, u, p], [own.rhs(z, u, p)], ["z", "u", "p"], ["dz"]),
+            casadi.Function(f"{self.name}_leave", [z, p], [own.leave(z, p)], ["z", "p"], ["x"]),
+            (own.limits[0],) * own.size,
+            (own.limits[1],) * own.size,
+        )
+
+    @property
+    def _groups(self) -> tuple[tuple[Quantity, ...], ...]:
+        return self.states, self.inputs, self.params
+
 
 @dataclass(frozen=True)
 class Declared:
@@ -110,7 +176,8 @@ class Declared:
         name: letters, digits and single underscores.
         dt: duration of one transition, s.
         substeps: RK4 steps per transition.
-        states: name: {unit, range: [low, high], periodic: false}; none for a static function.
+        states: name: {unit, range: [low, high], periodic: false, limits: [low, high]}; none for a static function. What
+            leaves the `limits` is put back after each Runge-Kutta step (null: no limit), e.g. a level that cannot be negative.
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
@@ -134,6 +201,8 @@ class Declared:
     outputs: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
 
+    symbol: ClassVar[Any] = casadi.SX
+
     def model(self) -> Model:
         """Check everything and build the model.
 
@@ -146,33 +215,34 @@ class Declared:
                 f"sim.name: {self.name!r} is no model name; allowed: letters, digits and single underscores, "
                 "beginning with a letter, no word that CasADi reserves"
             )
-        dt = _number("sim.dt", self.dt)
+        dt = read_number("sim.dt", self.dt)
         if dt <= 0:
             raise ModelError(f"sim.dt: {dt:g} s is not positive; give the duration of one transition in seconds")
         if not isinstance(self.substeps, int) or isinstance(self.substeps, bool) or self.substeps < 1:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
-        states = tuple(_variable(f"sim.states.{name}", name, node) for name, node in self.states.items())
-        inputs = tuple(_variable(f"sim.inputs.{name}", name, node, TIMES) for name, node in self.inputs.items())
-        outputs = tuple(_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
+        states = tuple(read_variable(f"sim.states.{name}", name, node, LIMITS) for name, node in self.states.items())
+        inputs = tuple(read_variable(f"sim.inputs.{name}", name, node, TIMES) for name, node in self.inputs.items())
+        outputs = tuple(read_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
         if not states and not outputs:
             raise ModelError(
                 "sim.states: neither states nor outputs: declare a state, or an output of a static function"
             )
         self._check_dynamics()
         params, fixed, derived = self._parameters()
-        measured = {name: _expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
+        measured = {name: read_expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
 
-        def terms(section: str, formulas: Mapping[str, Any], x: Symbol, u: Symbol, p: Symbol) -> Symbol:
-            scope: dict[str, Symbol] = {name: casadi.SX(value) for name, value in fixed.items()}
+        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
             for group, column in ((states, x), (inputs, u), (params, p)):
                 scope |= {quantity.name: column[row] for row, quantity in enumerate(group)}
             for name, formula in derived.items():
-                scope[name] = _term(f"sim.parameters.{name}", formula, scope)
-            rows = [_term(f"sim.{section}.{name}", formula, scope) for name, formula in formulas.items()]
-            return casadi.vertcat(*rows) if rows else casadi.SX(0, 1)
+                scope[name] = read_term(f"sim.parameters.{name}", formula, scope)
+            return scope
 
-        rates = {name: self.dynamics[name] for name in self.states}
+        def outputs_of(scope: dict[str, Symbol]) -> list[Symbol]:
+            return [read_term(f"sim.outputs.{name}", formula, scope) for name, formula in measured.items()]
+
         model = Model(
             name=self.name,
             dt=dt,
@@ -181,21 +251,34 @@ class Declared:
             inputs=inputs,
             params=params,
             outputs=outputs,
-            rhs=lambda x, u, p: terms("dynamics", rates, x, u, p),
-            output=lambda x, u, p: terms("outputs", measured, x, u, p),
+            rhs=lambda x, u, p: column(self.symbol, self.rates(known(x, u, p))),
+            output=lambda x, u, p: column(self.symbol, outputs_of(known(x, u, p))),
             gap=self._gap(),
             fixed=fixed,
-            delay=_times("delay", self.inputs, params, fixed),
-            lag=_times("lag", self.inputs, params, fixed),
+            delay=read_times("delay", self.inputs, params, fixed),
+            lag=read_times("lag", self.inputs, params, fixed),
+            limits={
+                name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
+            },
+            coordinates=self.own_coordinates(known),
+            symbol=self.symbol,
         )
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
+
+    def rates(self, known: Mapping[str, Symbol]) -> list[Symbol]:
+        """Return d(state)/dt in the order of the states, from what every name stands for."""
+        return [read_term(f"sim.dynamics.{name}", self.dynamics[name], known) for name in self.states]
+
+    def own_coordinates(self, known: Callable[[Symbol, Symbol, Symbol], dict[str, Symbol]]) -> Coordinates | None:
+        """Return the coordinates in which a transition is integrated; None: the states."""
+        return None
 
     def _check_names(self) -> None:
         taken: dict[str, str] = {}
         for section in ("states", "inputs", "parameters", "outputs", "dynamics", "gap"):
             path, node = f"sim.{section}", getattr(self, section)
-            _mapping(path, node)
+            check_mapping(path, node)
             for name in node:
                 if isinstance(name, bool):
                     raise ModelError(
@@ -219,7 +302,7 @@ class Declared:
     def _check_dynamics(self) -> None:
         for name in self.dynamics:
             if name not in self.states:
-                _unknown(f"sim.dynamics.{name}", "is no state", name, self.states)
+                refuse_unknown(f"sim.dynamics.{name}", "is no state", name, self.states)
         for name in self.states:
             if name not in self.dynamics:
                 raise ModelError(f"sim.dynamics: no entry for the state {name}; add `{name}: <its time derivative>`")
@@ -228,8 +311,10 @@ class Declared:
         gap = {}
         for name, value in self.gap.items():
             if name not in self.states and name not in self.outputs:
-                _unknown(f"sim.gap.{name}", "is neither a state nor an output", name, [*self.states, *self.outputs])
-            gap[name] = _number(f"sim.gap.{name}", value)
+                refuse_unknown(
+                    f"sim.gap.{name}", "is neither a state nor an output", name, [*self.states, *self.outputs]
+                )
+            gap[name] = read_number(f"sim.gap.{name}", value)
             if gap[name] < 0:
                 raise ModelError(f"sim.gap.{name}: {gap[name]:g} is negative; give a standard deviation, 0 for none")
         return gap
@@ -244,19 +329,21 @@ class Declared:
             if isinstance(node, str):
                 formulas[name] = node
             elif not isinstance(node, Mapping):
-                fixed[name] = _number(path, node)
+                fixed[name] = read_number(path, node)
             elif "value" in node:
-                _keys(path, node, ("unit", "value"), "a known parameter takes no range")
-                _unit(path, node)
-                fixed[name] = _number(f"{path}.value", node["value"])
+                check_keys(path, node, ("unit", "value"), "a known parameter takes no range")
+                read_unit(path, node)
+                fixed[name] = read_number(f"{path}.value", node["value"])
             else:
-                _keys(path, node, ("unit", "range", "prior"), "`value: <number>` in place of a range makes it known")
-                uncertain.append(_uncertain(path, name, node))
+                check_keys(
+                    path, node, ("unit", "range", "prior"), "`value: <number>` in place of a range makes it known"
+                )
+                uncertain.append(read_uncertain(path, name, node))
         derived: dict[str, str] = {}
         for name in self._order(formulas):
             if symbols_used(formulas[name]) <= fixed.keys():
                 scope = {other: casadi.SX(value) for other, value in fixed.items()}
-                fixed[name] = float(_term(f"sim.parameters.{name}", formulas[name], scope))
+                fixed[name] = float(read_term(f"sim.parameters.{name}", formulas[name], scope))
             else:
                 derived[name] = formulas[name]
         return tuple(uncertain), fixed, derived
@@ -270,7 +357,7 @@ class Declared:
             except ExpressionError as error:
                 raise ModelError(f"{path}: {error}") from None
             for other in sorted(uses[name] - self.parameters.keys()):
-                _unknown(path, f"uses {other}, which is no parameter", other, self.parameters)
+                refuse_unknown(path, f"uses {other}, which is no parameter", other, self.parameters)
         try:
             order = list(TopologicalSorter(uses).static_order())
         except CycleError as error:
@@ -281,117 +368,6 @@ class Declared:
         return [name for name in order if name in formulas]
 
 
-def _mapping(path: str, node: Any) -> None:
-    if not isinstance(node, Mapping):
-        raise ModelError(f"{path}: {node!r} is not a mapping; write `{path.rsplit('.')[-1]}: {{name: ...}}`")
-
-
-def _unknown(path: str, problem: str, word: str, allowed: Iterable[str]) -> NoReturn:
-    known = list(allowed)
-    raise ModelError(f"{path}: {problem}; known: {', '.join(known) or 'none'}.{did_you_mean(word, known)}")
-
-
-def _keys(path: str, node: Any, allowed: tuple[str, ...], cure: str = "leave it out") -> None:
-    _mapping(path, node)
-    for key in node:
-        if key not in allowed:
-            hint = did_you_mean(str(key), list(allowed))
-            raise ModelError(f"{path}.{key}: unknown key; allowed: {', '.join(allowed)}; {cure}.{hint}")
-
-
-def _unit(path: str, node: Mapping[str, Any]) -> str:
-    unit = node.get("unit", "")
-    if not isinstance(unit, str):
-        raise ModelError(f'{path}.unit: {unit!r} is not a text; quote it, e.g. unit: "1" for a number without unit')
-    return unit
-
-
-def _number(path: str, value: Any) -> float:
-    """Read a number, or a text of one: YAML 1.1 takes `1e-3` for a text, and `2*pi` is worth allowing."""
-    if isinstance(value, str):
-        value = float(_term(path, value, {}))
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ModelError(f"{path}: {value!r} is not a number")
-    if not math.isfinite(value):
-        raise ModelError(f"{path}: {value} is not finite; give a finite number")
-    return float(value)
-
-
-def _term(path: str, formula: Any, scope: Mapping[str, Symbol]) -> Symbol:
-    if isinstance(formula, bool) or not isinstance(formula, (str, int, float)):
-        raise ModelError(f"{path}: {formula!r} is no expression; write a formula, e.g. -k*x, or a number")
-    try:
-        return parse(str(formula), scope)
-    except ExpressionError as error:
-        raise ModelError(f"{path}: {error}") from None
-
-
-def _range(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
-    if "range" not in node:
-        raise ModelError(f"{path}: no range; add `range: [low, high]`")
-    ends = node["range"]
-    if not isinstance(ends, (list, tuple)) or len(ends) != 2:
-        raise ModelError(f"{path}.range: {ends!r} is not a range; write [low, high]")
-    low, high = (_number(f"{path}.range", end) for end in ends)
-    if low >= high:
-        cure = "swap them" if low > high else "give low < high"
-        raise ModelError(f"{path}.range: low = {low:g} is not below high = {high:g}; {cure}")
-    return low, high
-
-
-def _variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -> Quantity:
-    _keys(path, node, ("unit", "range", "periodic", *more))
-    periodic = node.get("periodic", False)
-    if not isinstance(periodic, bool):
-        raise ModelError(f"{path}.periodic: {periodic!r} is not allowed; write true or false")
-    if periodic and _unit(path, node) not in ("rad", ""):
-        raise ModelError(
-            f"{path}.unit: {node['unit']!r} is not allowed for a periodic state, whose sine and cosine are learned; use rad "
-            "(convert the column of the measurements, too)"
-        )
-    return Quantity(name, _unit(path, node), *_range(path, node), periodic=periodic)
-
-
-def _times(
-    key: str, inputs: Mapping[str, Any], params: tuple[Quantity, ...], fixed: dict[str, float]
-) -> dict[str, float | str]:
-    """Read the delays or lags of the inputs: a number, or the name of a parameter."""
-    known = {q.name: q.low for q in params} | fixed
-    found: dict[str, float | str] = {}
-    for name, node in inputs.items():
-        if key not in node:
-            continue
-        path, value = f"sim.inputs.{name}.{key}", node[key]
-        if isinstance(value, str) and value not in known:
-            _unknown(path, f"{value!r} is neither a number (s) nor a parameter", value, known)
-        least = known[value] if isinstance(value, str) else _number(path, value)
-        found[name] = value if isinstance(value, str) else least
-        if least < 0:
-            raise ModelError(f"{path}: {least:g} s is negative; an input cannot act before it is given")
-    return found
-
-
-def _uncertain(path: str, name: str, node: Mapping[str, Any]) -> Quantity:
-    prior = node.get("prior", "uniform")
-    if prior not in PRIORS:
-        _unknown(f"{path}.prior", f"{prior!r} is no prior", str(prior), PRIORS)
-    low, high = _range(path, node)
-    if prior == "lognormal" and low <= 0:
-        raise ModelError(f"{path}.range: low = {low:g} has no logarithm; a lognormal prior needs 0 < low")
-    return Quantity(name, _unit(path, node), low, high, prior=prior)
-
-
-def _output(path: str, name: str, node: Any) -> Quantity:
-    unit = ""
-    if isinstance(node, Mapping):
-        _keys(path, node, ("unit", "expression"))
-        unit = _unit(path, node)
-    return Quantity(name, unit, math.nan, math.nan)
-
-
-def _expression(path: str, node: Any) -> Any:
-    if not isinstance(node, Mapping):
-        return node
-    if "expression" not in node:
-        raise ModelError(f"{path}: no expression; add `expression: <formula>`")
-    return node["expression"]
+def column(symbol: Any, rows: list[Symbol]) -> Symbol:
+    """Stack rows; none make an empty column."""
+    return casadi.vertcat(*rows) if rows else symbol(0, 1)

@@ -5,7 +5,8 @@ from typing import Any
 
 import yaml
 
-from simulators.model import Declared, Model
+from simpel_cli.nodes import build
+from simulators.model import Model
 
 SIMS = Path(__file__).parents[1] / "conf" / "sim"
 SYMBOLIC = sorted(p.stem for p in SIMS.glob("*.yaml") if "_target_: simulators.worlds" not in p.read_text())
@@ -13,13 +14,22 @@ SYMBOLIC = sorted(p.stem for p in SIMS.glob("*.yaml") if "_target_: simulators.w
 
 def node(name: str) -> dict[str, Any]:
     """Fields of a declared simulator."""
-    content = yaml.safe_load((SIMS / f"{name}.yaml").read_text())
+    content = whole_node(name)
     assert content.pop("_target_") == "simulators.model.Declared"
+    return content
+
+
+def whole_node(name: str) -> dict[str, Any]:
+    """Node of a simulator, with its `_target_`."""
+    content: dict[str, Any] = yaml.safe_load((SIMS / f"{name}.yaml").read_text())
     return content
 
 
 def model(name: str, **known: float) -> Model:
     """The model of a file; parameters in `known` become numbers."""
-    content = node(name)
-    content["parameters"] |= known
-    return Declared(**content).model()
+    content = whole_node(name)
+    if known:
+        content["parameters"] = content["parameters"] | known
+    built = build(content, "sim").model()
+    assert isinstance(built, Model)
+    return built

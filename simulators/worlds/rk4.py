@@ -6,7 +6,9 @@ from functools import cached_property
 import casadi
 import numpy as np
 
-from simulators.model import Model, ModelError
+from simulators.model import Flow, Model, ModelError
+
+TIE = 1e-9  # rows; a delay of a whole number of rows must not become a sliver of another input
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,40 +18,111 @@ class RK4:
     Args:
         model: the symbolic model.
 
+    Raises:
+        ModelError: an input has a lag, whose past is endless.
+
     """
 
     model: Model
 
     def __post_init__(self) -> None:
-        """Refuse inputs with a memory: a query has no past."""
-        for key, times in (("delay", self.model.delay), ("lag", self.model.lag)):
-            for name in times:
-                raise ModelError(
-                    f"sim.inputs.{name}.{key}: a simulator asked for single transitions cannot hold inputs back; leave the "
-                    f"{key} out, or take a MuJoCo world, whose inputs may have one"
-                )
+        """Refuse inputs with an endless memory: a query has a finite past."""
+        for name in self.model.lag:
+            raise ModelError(
+                f"sim.inputs.{name}.lag: a simulator asked for single transitions cannot lag inputs; leave the lag out, or "
+                "make it a state of its own"
+            )
+
+    @property
+    def past(self) -> int:
+        """Number of inputs before its own that a transition depends on."""
+        return int(np.ceil(self.model.memory() / self.model.dt - TIE))
 
     def step(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Integrate n queries over dt: states (n, dx), inputs (n, du), params (n, dp) -> (n, dx), not wrapped."""
-        h = self.model.dt / self.model.substeps
-        x = np.asarray(states, float)
-        for _ in range(self.model.substeps):
-            k1 = self._evaluate(x, inputs, params)[0]
-            k2 = self._evaluate(x + h / 2 * k1, inputs, params)[0]
-            k3 = self._evaluate(x + h / 2 * k2, inputs, params)[0]
-            k4 = self._evaluate(x + h * k3, inputs, params)[0]
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return x
+        """Integrate n queries over dt: states (n, dx), inputs (n, du), params (n, dp) -> (n, dx), not wrapped.
+
+        Raises:
+            ModelError: an input has a delay; what it was before is asked for (`follow`).
+
+        """
+        for name in self.model.delay:
+            raise ModelError(
+                f"sim.inputs.{name}.delay: a simulator asked for single transitions cannot hold inputs back; leave the "
+                "delay out, or simulate trajectories"
+            )
+        return self.follow(states, inputs[:, None], params)
+
+    def follow(self, states: np.ndarray, history: np.ndarray, params: np.ndarray) -> np.ndarray:
+        """Integrate n queries over dt, late inputs exactly: between two arrivals all are constant.
+
+        Args:
+            states: (n, dx).
+            history: (n, past + 1, du) inputs, oldest first, each held for dt; the last one is given now.
+            params: (n, dp).
+
+        Returns:
+            The states dt later, (n, dx), not wrapped.
+
+        """
+        p = np.asarray(params, float)
+        rows = self._delays(p) / self.model.dt
+        whole = np.floor(rows + TIE)
+        part = np.clip(rows - whole, 0.0, None)  # of the transition, before the newer of two inputs arrives
+        part[part < TIE] = 0.0
+        edges = np.sort(np.column_stack([np.zeros(len(p)), part, np.ones(len(p))]), axis=1)
+        z = np.asarray(states, float)
+        if self._flow.enter is not None:
+            z = _evaluate(self._flow.enter, z, p)
+        newest = history.shape[1] - 1
+        for k in range(edges.shape[1] - 1):
+            begin, length = edges[:, k], edges[:, k + 1] - edges[:, k]
+            if not length.any():
+                continue
+            back = (whole + (begin[:, None] < part)).astype(int)
+            u = np.take_along_axis(history, newest - back[:, None, :], axis=1)[:, 0]
+            z = self._hold(z, u, p, length * self.model.dt)
+        return z if self._flow.leave is None else _evaluate(self._flow.leave, z, p)
 
     def measure(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
         """Return the outputs at n points, (n, dy)."""
-        return self._evaluate(states, inputs, params)[1]
+        return _evaluate(self._whole, states, inputs, params, result=1)
 
     @cached_property
-    def _function(self) -> casadi.Function:
+    def _whole(self) -> casadi.Function:
         return self.model.function()
 
-    def _evaluate(self, *arguments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        n = len(arguments[0])
-        dx, y = self._function.map(n)(*(casadi.DM(np.asarray(a, float).T) for a in arguments))
-        return dx.full().T, y.full().T
+    @cached_property
+    def _flow(self) -> Flow:
+        return self.model.flow()
+
+    def _delays(self, params: np.ndarray) -> np.ndarray:
+        """Return how late every input acts in every query, s, (n, du)."""
+        names = [q.name for q in self.model.params]
+        late = np.zeros((len(params), len(self.model.inputs)))
+        for i, q in enumerate(self.model.inputs):
+            value = self.model.delay.get(q.name, 0.0)
+            own = self.model.fixed.get(value, value) if isinstance(value, str) else value
+            late[:, i] = params[:, names.index(own)] if isinstance(own, str) else own
+        return late
+
+    def _hold(self, z: np.ndarray, u: np.ndarray, p: np.ndarray, duration: np.ndarray) -> np.ndarray:
+        """Integrate (n, dz) with constant inputs (n, du), each query for its own duration (n,), s."""
+        h = (duration / self.model.substeps)[:, None]
+        low, high = np.array(self._flow.low), np.array(self._flow.high)
+        for _ in range(self.model.substeps):
+            k1 = _evaluate(self._flow.rhs, z, u, p)
+            k2 = _evaluate(self._flow.rhs, z + h / 2 * k1, u, p)
+            k3 = _evaluate(self._flow.rhs, z + h / 2 * k2, u, p)
+            k4 = _evaluate(self._flow.rhs, z + h * k3, u, p)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            if self._flow.limited:
+                z = np.clip(z, low, high)
+        return z
+
+
+def _evaluate(function: casadi.Function, *arguments: np.ndarray, result: int = 0) -> np.ndarray:
+    """Evaluate a function of columns at n points, (n, rows) each."""
+    found = function.map(len(arguments[0]))(*(casadi.DM(np.asarray(a, float).T) for a in arguments))
+    value = found[result] if isinstance(found, (tuple, list)) else found
+    rows: np.ndarray = value.full().T
+    return rows

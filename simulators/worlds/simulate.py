@@ -126,12 +126,19 @@ class Simulate:
             for k in range(n):
                 stream = self._stream(f"input.{quantity.name}", k)
                 inputs[k, :, i] = self.excitation.signal(stream, steps, source.dt, quantity)
-        step = RK4(source).step if isinstance(source, Model) else source.step
         params = np.tile(truth, (n, 1))
         states = np.zeros((n, steps, len(source.states)))
         states[:, 0] = self._initial(source)
+        model = RK4(source) if isinstance(source, Model) else None
+        past = model.past if model is not None else 0
+        given = np.concatenate(
+            [np.repeat(inputs[:, :1], past, axis=1), inputs], axis=1
+        )  # the first one was held before
         for j in range(1, steps):
-            states[:, j] = step(states[:, j - 1], inputs[:, j - 1], params)
+            if model is not None:
+                states[:, j] = model.follow(states[:, j - 1], given[:, j - 1 : j + past], params)
+            elif not isinstance(source, Model):
+                states[:, j] = source.step(states[:, j - 1], inputs[:, j - 1], params)
             self._check_finite(source, states[:, j], j)
         columns = {"episode": np.repeat(np.arange(n), steps), "t": np.tile(source.dt * np.arange(steps), n)}
         for i, quantity in enumerate(source.states):

@@ -1,0 +1,52 @@
+"""A simulator whose equations are written in Python; its YAML declares quantities, ranges and fidelity."""
+
+from dataclasses import dataclass
+
+from simulators.expression import ExpressionError, symbols_used
+from simulators.model import Declared, ModelError
+from simulators.quantity import refuse_unknown
+
+
+@dataclass(frozen=True)
+class Built(Declared):
+    """Base of simulators in Python: the fields of `Declared`, without `dynamics`.
+
+    A subclass says which names its equations use (`needed`) and returns the rates (`rates`), and, if a transition is not
+    integrated in the states, its own coordinates (`own_coordinates`). Parameters that only others are derived from may
+    have any name.
+    """
+
+    def needed(self) -> dict[str, tuple[str, ...]]:
+        """Return the names that the equations use: section (states, inputs, parameters) -> names, in any order."""
+        raise NotImplementedError
+
+    def _check_dynamics(self) -> None:
+        kind = type(self).__name__
+        if self.dynamics:
+            raise ModelError(f"sim.dynamics: the equations of {kind} are its own; leave dynamics out")
+        for section, names in self.needed().items():
+            given = getattr(self, section)
+            for name in names:
+                if name not in given:
+                    raise ModelError(f"sim.{section}: no {name}, which the equations of {kind} use; add `{name}: ...`")
+            if section == "parameters":
+                used = self._used()
+                spare = [name for name in given if name not in names and name not in used]
+            else:
+                spare = [name for name in given if name not in names]
+            if spare:
+                refuse_unknown(f"sim.{section}.{spare[0]}", f"the equations of {kind} do not use it", spare[0], names)
+
+    def _used(self) -> set[str]:
+        """Return the names that derived parameters, delays and lags refer to."""
+        formulas = [node for node in self.parameters.values() if isinstance(node, str)]
+        times = [node.get(key) for node in self.inputs.values() for key in ("delay", "lag") if isinstance(node, dict)]
+        return {name for formula in formulas for name in symbols_in(formula)} | {t for t in times if isinstance(t, str)}
+
+
+def symbols_in(formula: str) -> set[str]:
+    """Return the names in a formula, none if it cannot be read: that is told where it is used."""
+    try:
+        return symbols_used(formula)
+    except ExpressionError:
+        return set()
