@@ -6,6 +6,7 @@ The simulator part is sampled, the Gaussian part is known in closed form. `w` is
 error that keeps the joint law of many points non-degenerate; it belongs to the prior, so every score estimator sees it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,9 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.gp import Kernel, SquaredExponential, gram
 from simpel_cli.transition import OneStep, Transition
 from simulators.model import Quantity
+
+WIDE = 64  # numbers in a transition
+CACHED = 2**16  # numbers: a quarter of a megabyte in float32
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class FunctionPrior(NamedTuple):
         input_scale: factor from normalised inputs to units of the lengthscale, shape (dx,).
         params: uncertain parameters of the simulator.
         step: the simulator's one-step map; None: no simulator part (zero).
+        width: numbers that the integration of one transition carries.
         dim_y: number of outputs.
     """
 
@@ -70,6 +75,7 @@ class FunctionPrior(NamedTuple):
     input_scale: Float[Array | np.ndarray, " dx"]
     params: tuple[Quantity, ...]
     step: OneStep | None
+    width: int
     dim_y: int
 
     @property
@@ -83,8 +89,20 @@ class FunctionPrior(NamedTuple):
             return jnp.zeros((n, x.shape[0], self.dim_y), x.dtype)
         phi = sample_parameters(key, self.params, n, x.dtype)
         at_all_inputs = jax.vmap(self.step, in_axes=(0, None))
-        draws: Array = jax.vmap(at_all_inputs, in_axes=(None, 0))(x, phi)
+        draws: Array = self.a_few_at_a_time(lambda one: at_all_inputs(x, one), phi, copies=x.shape[0])
         return draws
+
+    def a_few_at_a_time(self, run: Callable[[Array], Array], over: Array, copies: int) -> Array:
+        """Apply a function of simulations along the first axis; of wide simulators so many at a time as fit the cache.
+
+        Args:
+            run: of one entry.
+            over: entries along the first axis.
+            copies: transitions that one entry takes.
+        """
+        if self.width <= WIDE or jax.default_backend() != "cpu":
+            return jax.vmap(run)(over)
+        return jax.lax.map(run, over, batch_size=min(max(1, CACHED // (self.width * copies)), over.shape[0]))
 
     def covariance(self, x: Float[Array, "M dx"], scale: Float[Array | np.ndarray, " dy"]) -> Float[Array, "dy M M"]:
         """Covariance of the Gaussian part; the correlation matrix is shared by the outputs."""
@@ -123,10 +141,10 @@ class SimulatorPrior:
         self, system: Transition | None, dim_x: int, dim_y: int, x_std: Float[Array | np.ndarray, " dx"]
     ) -> FunctionPrior:
         """Bind to a simulator (None: it can only be queried, and its draws come as a bank)."""
-        step, params = (system.step, system.params) if system is not None else (None, ())
+        step, params, width = (system.step, system.params, system.width) if system is not None else (None, (), 0)
         kernel = self.gap.kernel if self.gap is not None else None
         input_scale = _input_scale(self.gap, x_std) if self.gap is not None else np.ones(dim_x)
-        return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, dim_y)
+        return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, width, dim_y)
 
 
 @dataclass(frozen=True)
@@ -166,7 +184,7 @@ class GPPrior:
     ) -> FunctionPrior:
         """Bind to the dimensions of a system; its simulator is not used."""
         return FunctionPrior(
-            self.draws, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, dim_y
+            self.draws, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, 0, dim_y
         )
 
 

@@ -24,12 +24,21 @@ OneStep = Callable[[Float[Array, " dx"], Float[Array, " dp"]], Float[Array, " dy
 
 
 class Transition(NamedTuple):
-    """A simulator as a function of a network input and uncertain parameters."""
+    """A simulator as a function of a network input and uncertain parameters.
+
+    Args:
+        encoding: coordinates.
+        params: of the simulator.
+        gap: expected model error.
+        step: one-step map.
+        width: numbers that the integration of one transition carries.
+    """
 
     encoding: Encoding
     params: tuple[Quantity, ...]
     gap: dict[str, float]
     step: OneStep
+    width: int
 
 
 def encoding_of(model: Model | World, outputs: tuple[str, ...] = (), stack: int = 0) -> Encoding:
@@ -89,7 +98,8 @@ def transition(model: Model, encoding: Encoding) -> Transition:
         after = follow(state, stacked, phi) if model.states else state
         return encoding.to_y(state, after, outputs)
 
-    return Transition(encoding, model.params, model.gap, step)
+    width = model.coordinates.size if model.coordinates is not None else len(model.states)
+    return Transition(encoding, model.params, model.gap, step, width)
 
 
 def _integrated(

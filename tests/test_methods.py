@@ -44,7 +44,7 @@ def line(x: jax.Array, phi: jax.Array) -> jax.Array:
 
 def prior_of(gap: bool = False, params: tuple[Quantity, ...] = PARAMS) -> FunctionPrior:
     kernel = GPPrior().kernel if gap else None
-    return FunctionPrior(64, 1e-8, kernel, np.ones(1), params, line, 1)
+    return FunctionPrior(64, 1e-8, kernel, np.ones(1), params, line, 1, 1)
 
 
 def problem_of(y: np.ndarray, kappa: float = 0.0, x: np.ndarray = X) -> Problem:
@@ -388,7 +388,7 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
     def two(x: jax.Array, phi: jax.Array) -> jax.Array:
         return jnp.concatenate([phi[:1] * x + 20.0, phi[1:] * x - 300.0])
 
-    prior = FunctionPrior(16, 1e-4, GPPrior().kernel, np.ones(1), PARAMS, two, 2)
+    prior = FunctionPrior(16, 1e-4, GPPrior().kernel, np.ones(1), PARAMS, two, 1, 2)
     x = np.repeat(X[None], seeds, axis=0)
     y = np.concatenate([1.3 * X, 0.5 * X], axis=1)[None] + np.zeros((seeds, 1, 1))
     pad = padded_length(N)

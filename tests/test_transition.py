@@ -79,7 +79,7 @@ def test_simulators_agree_with_casadi(sim: str) -> None:
     function = m.function()
     rng = np.random.default_rng(3)
     groups = [np.array([[q.low, q.high] for q in g]).reshape(-1, 2) for g in (m.states, m.inputs)]
-    n = 20
+    n = 20 if len(m.params) < 1000 else 2
     x, u = (rng.uniform(g[:, 0], g[:, 1], (n, len(g))) for g in groups)
     p = draw(m.params, rng, n)
     symbols = [function.sx_in(i) for i in range(3)]

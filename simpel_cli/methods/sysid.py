@@ -20,21 +20,23 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.predictive import Predictive
-from simpel_cli.prior import FunctionPrior
+from simpel_cli.prior import WIDE, FunctionPrior
 from simpel_cli.transition import OneStep
 
 FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
 EASIER, HARDER = 0.3, 5.0  # what the damping is multiplied by
+SMALL, PATIENCE = 1e-6, 4  # a start has ended where its loss falls by less than so much of itself, so many times on end
 FAR = 6.0  # standard deviations of a normal prior that a parameter may go
 
 
 class State(NamedTuple):
-    """Every start of the search: unit coordinates, noise, damping, and the loss there."""
+    """Every start of the search: unit coordinates, noise, damping, the loss there, and steps on end that gained nothing."""
 
     u: Float[Array, "S dp"]
     rho: Float[Array, "S dy"]
     damping: Float[Array, " S"]
     loss: Float[Array, " S"]
+    idle: Float[Array, " S"]
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class SysID:
         counts = (jnp.arange(n_rows, dtype=jnp.int32) < problem.m).astype(dtype)[:, None]
 
         def simulated(u: Float[Array, " dp"], x: Float[Array, "n dx"]) -> Float[Array, "n dy"]:
-            y = jax.vmap(run, in_axes=(0, None))(x, physical(prior, u))
+            phi = physical(prior, u)
+            y = prior.a_few_at_a_time(lambda row: run(row, phi), x, copies=1 + dim_u)  # the value and its derivatives
             return (y - scale.y_mean[None]) / scale.y_std[None]
 
         def sigma(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
@@ -117,7 +120,13 @@ class SysID:
             good = jnp.isfinite(value) & (value < state.loss)
             here = jnp.where(good, new, at)
             damping = jnp.clip(state.damping * jnp.where(good, EASIER, HARDER), 1e-9, MOST_DAMPING)
-            return State(here[:dim_u], here[dim_u:], damping.astype(dtype), jnp.where(good, value, state.loss))
+            gained = jnp.where(good, state.loss - value, 0.0) > SMALL * (1 + jnp.abs(state.loss))
+            idle = jnp.where(gained, 0.0, state.idle + 1).astype(dtype)
+            return State(here[:dim_u], here[dim_u:], damping.astype(dtype), jnp.where(good, value, state.loss), idle)
+
+        def all_better(state: State) -> State:
+            """One step of every start; starts of a wide simulator one after the other."""
+            return jax.vmap(better)(state) if prior.width <= WIDE else jax.lax.map(better, state)
 
         def init(key: PRNGKeyArray) -> State:
             random = jax.random.uniform(key, (self.starts, dim_u), dtype, 0.05, 0.95)
@@ -128,10 +137,15 @@ class SysID:
             )
             first = jax.vmap(loss)(u, rho)
             damping = jnp.full((self.starts,), FIRST_DAMPING, dtype)
-            return State(u, rho, damping, jnp.where(jnp.isfinite(first), first, jnp.inf))
+            return State(u, rho, damping, jnp.where(jnp.isfinite(first), first, jnp.inf), jnp.zeros_like(damping))
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
-            after = jax.vmap(better)(state)
+            # a loop of one turn or none: where every start has ended, nothing is simulated, under vmap either
+            after, _ = jax.lax.while_loop(
+                lambda carry: carry[1] & jnp.any(carry[0].idle < PATIENCE),
+                lambda carry: (all_better(carry[0]), jnp.zeros((), bool)),
+                (state, jnp.ones((), bool)),
+            )
             best = jnp.argmin(after.loss)
             info = Info(after.loss[best] / problem.m.astype(dtype), sigma(after.rho[best]), jnp.zeros((), dtype))
             return after, info

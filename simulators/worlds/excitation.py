@@ -1,6 +1,6 @@
 """Input signals that excite a system."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -111,3 +111,53 @@ class Multisine:
         middle, half = (quantity.high + quantity.low) / 2, (quantity.high - quantity.low) / 2
         # rounding must not carry the peak out of the range
         return np.clip(middle + half * wave / np.abs(wave).max(), quantity.low, quantity.high)
+
+
+@dataclass(frozen=True)
+class OrnsteinUhlenbeck:
+    """A noise that is pulled towards a mean which is drawn anew now and then: somebody at the wheel.
+
+        u_{k+1} = clip(u_k + pull dt (mean - u_k) + noise sqrt(dt) N(0, 1)),   u_0 = 0
+
+    Everything in halves of the input's range about its middle.
+
+    Args:
+        pull: 1/s.
+        noise: per square root of a second.
+        hold: s, for which a mean is held.
+        means: input -> the means are uniform within so much of its range, 0 to 1; left out: 1.
+
+    Raises:
+        ModelError: a value that is not allowed.
+
+    """
+
+    pull: float = 3.0
+    noise: float = 1.3693
+    hold: float = 4 / 3
+    means: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not allowed."""
+        for key in ("pull", "noise", "hold"):
+            if not getattr(self, key) > 0:
+                raise ModelError(f"excitation.{key}: {getattr(self, key):g} is not positive")
+        for name, share in self.means.items():
+            if not 0 <= share <= 1:
+                raise ModelError(
+                    f"excitation.means.{name}: {share:g} is not allowed; give 0 to 1, a share of the range"
+                )
+
+    def signal(self, rng: np.random.Generator, n_steps: int, dt: float, quantity: Quantity) -> np.ndarray:
+        """Draw a signal, (n_steps,); a longer one begins with the shorter."""
+        held = max(1, round(self.hold / dt))
+        share = self.means.get(quantity.name, 1.0)
+        values, value, mean = np.empty(n_steps), 0.0, 0.0
+        for k in range(n_steps):
+            if k % held == 0:
+                mean = rng.uniform(-share, share)
+            value += self.pull * dt * (mean - value) + self.noise * np.sqrt(dt) * rng.normal()
+            value = min(max(value, -1.0), 1.0)
+            values[k] = value
+        middle, half = (quantity.high + quantity.low) / 2, (quantity.high - quantity.low) / 2
+        return np.clip(middle + half * values, quantity.low, quantity.high)

@@ -22,6 +22,8 @@ from simulators.worlds.rk4 import RK4
 from simulators.worlds.world import World
 
 OWN_COLUMNS = ("episode", "t", "split")
+LAYOUTS = ("trajectories", "transitions")
+NOISE_ON = ("both", "next")
 LICENCE = "made by simpel simulate: simulated data, not measured on a real system"
 
 
@@ -30,7 +32,8 @@ class Simulation(NamedTuple):
 
     Args:
         columns: name -> one value per row: episode, t (s), states, inputs, outputs, split (train or test). A static
-            model has no episode and no t.
+            model has no episode and no t. Layout transitions has neither, but next_<state>, the state dt later, and
+            exact_next_<state>, the same without noise.
         card: how they were made, of plain values fit for YAML; `columns` gives the unit of each column.
 
     """
@@ -46,6 +49,9 @@ class Simulate:
     Args:
         episodes: number of independent trajectories.
         steps: rows per episode, `dt` of the source apart.
+        layout: `trajectories`, or `transitions`: episodes times steps independent rows, each a state (uniform, `initial`), an
+            input (uniform on its range) and what follows.
+        noise_on: of layout transitions: noise on `both` states, or on the `next` one only.
         seed: of everything random.
         excitation: law of the inputs, each signal drawn on its own.
         initial: state -> [low, high] of its uniform initial value; left out: the declared range.
@@ -63,6 +69,8 @@ class Simulate:
 
     episodes: int = 20
     steps: int = 100
+    layout: str = "trajectories"
+    noise_on: str = "both"
     seed: int = 0
     excitation: Excitation = field(default_factory=HeldRandom)
     initial: dict[str, Any] = field(default_factory=dict)
@@ -77,6 +85,11 @@ class Simulate:
         for key, least in (("episodes", 1), ("steps", 1), ("seed", 0)):
             if getattr(self, key) < least:
                 raise ModelError(f"simulation.{key}: {getattr(self, key)} is not allowed; give at least {least}")
+        for key, allowed in (("layout", LAYOUTS), ("noise_on", NOISE_ON)):
+            if getattr(self, key) not in allowed:
+                raise ModelError(
+                    f"simulation.{key}: {getattr(self, key)!r} is not allowed, only {' or '.join(allowed)}"
+                )
         if not 0 <= self.test_fraction < 1:
             raise ModelError(f"simulation.test_fraction: {self.test_fraction:g} is not allowed; give 0 <= fraction < 1")
         for name, std in self.noise_std.items():
@@ -104,8 +117,14 @@ class Simulate:
         _known("truth", self.truth, source.params)
         _known("initial", self.initial, source.states)
         truth = self._truth(source)
-        columns = self._trajectories(source, truth) if source.states else self._static(source, truth)
-        columns = {name: values for name, values in columns.items() if name not in self.unmeasured}
+        if not source.states:
+            columns = self._static(source, truth)
+        elif self.layout == "transitions":
+            columns = self._transitions(source, truth)
+        else:
+            columns = self._trajectories(source, truth)
+        left_out = {f"{part}{name}" for name in self.unmeasured for part in ("", "next_", "exact_next_")}
+        columns = {name: values for name, values in columns.items() if name not in left_out}
         if self.test_fraction:
             rows = np.arange(self.episodes * self.steps)
             columns["split"] = self._split(columns.get("episode", rows))
@@ -147,6 +166,29 @@ class Simulate:
             columns[quantity.name] = inputs[:, :, i].ravel()
         flat = (states.reshape(n * steps, -1), inputs.reshape(n * steps, -1), np.tile(truth, (n * steps, 1)))
         return columns | self._outputs(source, flat, (n, steps))
+
+    def _transitions(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
+        """Independent rows: a state, an input and the state dt later."""
+        n = self.episodes * self.steps
+        ranges = [self._initial_range(q) for q in source.states]
+        before = np.column_stack([
+            self._stream(f"initial.{q.name}").uniform(*ends, n) for q, ends in zip(source.states, ranges, strict=True)
+        ])  # fmt: skip
+        inputs = np.zeros((n, len(source.inputs)))
+        for i, q in enumerate(source.inputs):
+            inputs[:, i] = self._stream(f"input.{q.name}").uniform(q.low, q.high, n)
+        params = np.tile(truth, (n, 1))
+        step = RK4(source).step if isinstance(source, Model) else source.step
+        after = step(before, inputs, params)
+        self._check_finite(source, after, 1)
+        columns = {}
+        for i, q in enumerate(source.states):
+            now = before[None, :, i]
+            columns[q.name] = self._measured(q, now, scale=1.0 if self.noise_on == "both" else 0.0)
+            columns[f"next_{q.name}"] = self._measured(q, after[None, :, i], stream="next_noise")
+            columns[f"exact_next_{q.name}"] = self._measured(q, after[None, :, i], scale=0.0)
+        columns |= {q.name: inputs[:, i] for i, q in enumerate(source.inputs)}
+        return columns | self._outputs(source, (before, inputs, params), (1, n))
 
     def _static(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
         """Rows of inputs uniform on their ranges, and the outputs there."""
@@ -194,10 +236,12 @@ class Simulate:
                 f"episode {k}; narrow simulation.initial or the inputs, or give {source.name} smaller steps"
             )
 
-    def _measured(self, quantity: Quantity, values: np.ndarray) -> np.ndarray:
+    def _measured(
+        self, quantity: Quantity, values: np.ndarray, stream: str = "noise", scale: float = 1.0
+    ) -> np.ndarray:
         """Add noise to the values (episodes, steps) of one quantity, wrap angles to [-pi, pi); one value per row."""
-        std = self.noise_std.get(quantity.name, 0.0)
-        noise = [self._stream(f"noise.{quantity.name}", k).normal(size=values.shape[1]) for k in range(len(values))]
+        std = scale * self.noise_std.get(quantity.name, 0.0)
+        noise = [self._stream(f"{stream}.{quantity.name}", k).normal(size=values.shape[1]) for k in range(len(values))]
         noisy = (values + std * np.array(noise)).ravel()
         if quantity.periodic:
             noisy = (noisy + np.pi) % (2 * np.pi) - np.pi
@@ -228,15 +272,23 @@ class Simulate:
             "dt": source.dt,
             "episodes": self.episodes,
             "steps": self.steps,
-            "columns": {name: {"unit": units[name]} for name in columns if name in units},
+            "columns": {name: {"unit": units[bare]} for name in columns if (bare := _bare(name)) in units},
             "noise_std": {q.name: float(self.noise_std.get(q.name, 0)) for q in measured},
         }
-        if source.states:
+        if source.states and self.layout == "transitions":
+            card |= {"layout": self.layout, "noise_on": self.noise_on}
+        elif source.states:
             card["excitation"] = excitation
+        if source.states:
             card["initial"] = {q.name: list(self._initial_range(q)) for q in source.states if q in measured}
         if not self.hide_truth:
             card["truth"] = {q.name: float(value) for q, value in zip(source.params, truth, strict=True)}
         return card
+
+
+def _bare(column: str) -> str:
+    """Return the quantity that a column is about."""
+    return column.removeprefix("exact_").removeprefix("next_")
 
 
 def _known(key: str, given: Iterable[str], quantities: tuple[Quantity, ...]) -> None:
