@@ -204,3 +204,57 @@ def test_wrong_words_are_refused() -> None:
         model("racecar", delta_mx=1.0)
     with pytest.raises(ModelError, match=r"sim\.dynamics: the equations of RaceCar are its own"):
         RaceCar(name="car", dt=0.1, states=STATES, dynamics={"x": "vx"}).model()
+
+
+def test_late_commands_act_exactly_between_two_arrivals() -> None:
+    """Delay of 80 ms at 30 Hz (section 8): of a transition the first 0.4 belong to the command before the one that acts."""
+    known = HIGH | {"T_steer": 0.08, "T_throttle": 0.08}
+    source = model("rc_car_high_fidelity", **known)
+    assert RK4(source).past == 3
+    state = np.array([CASES["H1"][2]], float)
+    history = np.array([[[-0.5, 0.2], [0.3, 0.6], [0.9, 0.1], [0.0, 0.0]]])  # oldest first, the last one is given now
+    expected = [0.259727743, -0.08018340884, 0.3293868673, 1.794395705, 0.6189708571, 0.8517342585]
+    np.testing.assert_allclose(RK4(source).follow(state, history, np.zeros((1, 0)))[0], expected, rtol=1.01e-9)
+    # the mean of both commands, which the reference takes, is not the same
+    mean = car("high")
+    mixed = [0.2602009594, -0.07994285285, 0.3297624144, 1.811202275, 0.605883126, 0.7908822413]
+    np.testing.assert_allclose(after(mean, state, np.array([[-0.02, 0.44]]))[0], mixed, rtol=1.01e-9)
+    # in a learning problem the delay is continuous: the mean over the substep in which a command arrives
+    noise = np.array([1.1e-3, 1.1e-3, 1.8e-3, 8.2e-3, 8.2e-3, 3.7e-2])
+    np.testing.assert_array_less(np.abs(in_jax(source, state, history) - expected), noise / 3)
+    fine = in_jax(replace(source, substeps=30), state, history)  # the arrival lies between two substeps
+    np.testing.assert_allclose(fine, expected, rtol=1e-5)
+    assert (np.abs(np.array(mixed) - expected) > noise).any()
+
+
+def in_jax(source: Model, state: np.ndarray, history: np.ndarray) -> np.ndarray:
+    encoding = encoding_of(source, stack=3)
+    x = jnp.asarray(encoding.to_x(state[0], history[0].ravel()))
+    y = transition(source, encoding).step(x, jnp.zeros(0))
+    return np.asarray(encoding.decode(np.asarray(x[:7] + y)))
+
+
+def test_delays_apart_and_uncertain() -> None:
+    """Each query has its own delays, each input its own: three intervals; a whole number of rows is no sliver of another."""
+    source = model("rc_car_high_fidelity", **HIGH)
+    names = [q.name for q in source.params]
+    assert names == ["T_steer", "T_throttle"]
+    state = np.repeat(np.array([CASES["H1"][2]], float), 3, axis=0)
+    random = np.random.default_rng(0)
+    history = np.repeat(random.uniform(-1, 1, (1, 8, 2)), 3, axis=0)
+    found = RK4(source).follow(state, history, np.array([[0.1, 0.1], [0.1, 0.15], [0.08, 0.2]]))
+    held = after(car("high"), state[:1], history[:1, -4])  # both are three rows old
+    np.testing.assert_allclose(found[:1], held, rtol=1e-12)
+    dt, plain = 1 / 30, car("high")
+    shorter = replace(plain, dt=dt / 2, substeps=12)  # half a row after half a row: the throttle of 4.5 rows ago
+    first = RK4(shorter).step(state[:1], np.array([[history[0, -4, 0], history[0, -6, 1]]]), np.zeros((1, 0)))
+    second = RK4(shorter).step(first, np.array([[history[0, -4, 0], history[0, -5, 1]]]), np.zeros((1, 0)))
+    np.testing.assert_allclose(found[1:2], second, rtol=1e-6)
+    assert np.abs(found[2] - found[1]).max() > 1e-3
+
+
+def test_a_lag_has_no_end() -> None:
+    with pytest.raises(
+        ModelError, match=r"sim\.inputs\.steer\.lag: a simulator asked for single transitions cannot lag inputs"
+    ):
+        RK4(replace(car("high"), lag={"steer": 0.1}))

@@ -1,0 +1,237 @@
+"""Fits of a panel: every method on every training size and seed, resumable, two at a time, each on a core of its own.
+
+A fit is what `simpel fit` does with the words of the job; its directory keeps the configuration, the manifest and the metrics.
+"""
+
+import itertools
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from simpel_cli.config import launch
+from simpel_cli.errors import SimpelError
+from simpel_cli.plots.canvas import legend_below, line_style, new_figure, ratio_scale, save
+from simpel_cli.records import read_metrics, write_table
+from simpel_cli.run import read_manifest
+
+CONF = Path(__file__).parent / "conf"
+METRICS = ("nll", "nrmse", "crps", "coverage", "calibration_error")
+
+
+class Fit(NamedTuple):
+    """One fit of a panel: several model seeds at once.
+
+    Args:
+        system, method: names of the panel.
+        n_train: training transitions.
+        data_seed: of measurements, or of what of them is trained on.
+        words: overrides of `simpel fit`.
+    """
+
+    system: str
+    method: str
+    n_train: int
+    data_seed: int
+    words: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of its directory."""
+        return f"{self.system}-{self.method}-n{self.n_train}-s{self.data_seed}"
+
+
+class Cell(NamedTuple):
+    """What all fits of one method at one training size came to; rows: data seeds, columns: model seeds."""
+
+    values: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Mean over data seeds and model seeds."""
+        return float(np.nanmean(self.values))
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation over model seeds of the mean over data seeds, as the paper's bands have it."""
+        means = np.nanmean(self.values, axis=0)
+        return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+
+    @property
+    def range(self) -> tuple[float, float, float]:
+        """10 %, 50 % and 90 % of all fits."""
+        low, middle, high = np.nanpercentile(self.values, [10, 50, 90])
+        return float(low), float(middle), float(high)
+
+
+Table = dict[tuple[str, str, int], Cell]  # (system, method, n_train)
+
+
+def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
+    """Run what is missing, longest sizes first, and say how it goes; a fit that fails costs itself only."""
+    todo = [fit for fit in fits if not _done(out / fit.name)]
+    print(f"{len(fits)} fits, {len(fits) - len(todo)} are there, {len(todo)} to run", flush=True)
+    began = time.perf_counter()
+    context = multiprocessing.get_context("spawn")
+    cores = context.Queue()
+    for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0))), processes):
+        cores.put(core)
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=_pin, initargs=(cores,)) as pool:
+        # neighbours share system and method, and so the compiled program
+        running = {pool.submit(_fit, fit, out / fit.name): fit for fit in todo}
+        for done, future in enumerate(as_completed(running), 1):
+            fit, message = running[future], future.result()
+            left = (time.perf_counter() - began) / done * (len(todo) - done) / 60
+            print(f"{done}/{len(todo)}  {fit.name}  {message}  about {left:.0f} min left", flush=True)
+
+
+def _pin(cores: "multiprocessing.Queue[int]") -> None:
+    """Keep a worker on one core, before JAX counts them."""
+    os.sched_setaffinity(0, {cores.get()})
+
+
+def _done(directory: Path) -> bool:
+    try:
+        return bool(read_manifest(directory)["status"] == "done")
+    except SimpelError:
+        return False
+
+
+def _fit(fit: Fit, directory: Path) -> str:
+    from simpel_cli.commands.fit import fit as task
+
+    began = time.perf_counter()
+    for number in itertools.count():  # what a kill left behind stays for whoever wants to look at it
+        if not directory.exists():
+            break
+        if not (old := directory.with_name(f"{directory.name}.broken{number}")).exists():
+            directory.rename(old)
+    words = [*fit.words, f"hydra.run.dir={directory}", "run.figures=false", "run.quiet=true"]
+    try:
+        launch("fit", task, words, config_dir=CONF, flags=[])
+    except SimpelError as error:
+        return f"failed: {error}"
+    nll = [r["value"] for r in joint(directory) if r["metric"] == "nll"]
+    return f"NLL {np.mean(nll):.3g}  {time.perf_counter() - began:.0f} s"
+
+
+def joint(directory: Path) -> list[dict[str, object]]:
+    """Return the joint test metrics of a fit, a row for each model seed."""
+    rows = read_metrics(directory / "metrics.parquet")
+    return [r for r in rows if r["split"] == "test" and r["output"] == "joint" and r["metric"] in METRICS]
+
+
+def collect(fits: Iterable[Fit], out: Path, name: str) -> dict[str, Table]:
+    """Write `name`.parquet of all fits that are done, and return metric -> table."""
+    rows = []
+    for fit in fits:
+        if _done(out / fit.name):
+            rows += [
+                (fit.system, fit.method, fit.n_train, fit.data_seed, r["seed"], r["metric"], r["value"])
+                for r in joint(out / fit.name)
+            ]
+    columns = ("system", "method", "n_train", "data_seed", "model_seed", "metric", "value")
+    write_table(out / f"{name}.parquet", {c: [row[i] for row in rows] for i, c in enumerate(columns)})
+    found: dict[str, Table] = {}
+    for metric in METRICS:
+        own = [row for row in rows if row[5] == metric]
+        table: Table = {}
+        for key in dict.fromkeys(row[:3] for row in own):
+            cell = [row for row in own if row[:3] == key]
+            data, models = (sorted({row[i] for row in cell}) for i in (3, 4))
+            values = np.full((len(data), len(models)), np.nan)
+            for row in cell:
+                values[data.index(row[3]), models.index(row[4])] = row[6]
+            table[key] = Cell(values)
+        found[metric] = table
+    return found
+
+
+def sizes_of(table: Table, system: str) -> list[int]:
+    """Return the training sizes of a system."""
+    return sorted({n for s, _, n in table if s == system})
+
+
+def methods_of(table: Table, system: str) -> list[str]:
+    """Return the methods of a system, in the order in which they were run."""
+    return list(dict.fromkeys(m for s, m, _ in table if s == system))
+
+
+def advantage(table: Table, system: str, one: str, other: str, n: int) -> tuple[float, float]:
+    """Return how much lower `one` is than `other`, paired, and the half width of its 95 % interval over data seeds."""
+    gap = table[system, other, n].values - table[system, one, n].values
+    means = np.nanmean(gap, axis=1)
+    if len(means) < 2:
+        return float(means.mean()), float("nan")
+    half = scipy.stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
+    return float(means.mean()), float(half)
+
+
+def draw(path: Path, panels: Sequence[tuple[str, str, Table]], labels: dict[str, str], columns: int) -> None:
+    """Draw a metric against training size, a line with the spread over model seeds for every method.
+
+    Args:
+        path: of the PNG.
+        panels: (system, metric, table) of every axis.
+        labels: metric -> label of its axis.
+        columns: of axes.
+    """
+    every = list(dict.fromkeys(m for system, _, table in panels for m in methods_of(table, system)))
+    figure, axes = new_figure(len(panels), 3.6, 3.0, columns=columns)
+    for axis, (system, metric, table) in zip(axes, panels, strict=True):
+        tops = []
+        for method in methods_of(table, system):
+            sizes = [n for n in sizes_of(table, system) if (system, method, n) in table]
+            middle = np.array([table[system, method, n].mean for n in sizes])
+            half = np.array([table[system, method, n].spread for n in sizes])
+            style = line_style(every.index(method)) | {"marker": "o", "markevery": 1}
+            axis.fill_between(sizes, middle - half, middle + half, color=style["color"], alpha=0.2, linewidth=0)
+            axis.plot(sizes, middle, label=method, **style)
+            tops.append(middle)
+        sizes = sizes_of(table, system)
+        axis.set(title=system, xlabel="training transitions", ylabel=labels[metric], xscale="log")
+        axis.set_xticks(sizes, [str(n) for n in sizes])
+        axis.minorticks_off()
+        if metric == "nll":
+            values = np.concatenate(tops)
+            low = np.nanmin(values)
+            # lines far above the best would flatten the others into one
+            span = 3 * max(np.nanmedian(values) - low, 1.0)
+            axis.set_ylim(low - 0.08 * span, min(np.nanmax(values), low + span) + 0.05 * span)
+        else:
+            ratio_scale(axis)
+    legend_below(figure, axes[0])
+    save(figure, path)
+
+
+def markdown(table: Table, systems: Iterable[str], best: Callable[[Iterable[float]], float] = min) -> list[str]:
+    """Return tables of mean and spread, a row per method, the best of every size in bold."""
+    lines = []
+    for system in systems:
+        sizes = sizes_of(table, system)
+        lines += [
+            "",
+            f"### {system}",
+            "",
+            f"| | {' | '.join(f'n = {n}' for n in sizes)} |",
+            "|---" * (len(sizes) + 1) + "|",
+        ]
+        methods = methods_of(table, system)
+        winner = {n: best(table[system, m, n].mean for m in methods if (system, m, n) in table) for n in sizes}
+        for method in methods:
+            cells = []
+            for n in sizes:
+                cell = table.get((system, method, n))
+                if cell is None:
+                    cells.append("-")
+                    continue
+                text = f"{cell.mean:.3g} ± {cell.spread:.2g}"
+                cells.append(f"**{text}**" if cell.mean == winner[n] else text)
+            lines.append(f"| {method} | {' | '.join(cells)} |")
+    return lines

@@ -1,0 +1,186 @@
+"""The paper's panel (a): test NLL against training size on four simulated systems.
+
+    python -m tests.reproduce.panel_a --size small --out runs/reproduce/panel_a
+
+Truth: one draw of the high-fidelity parameters per data seed, states and inputs uniform in the box of the data, noise on what
+follows, 1000 test rows. Prior: the low-fidelity simulator. The same data, normalisation, noise model and number of steps for
+every method that learns a network.
+"""
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+from simpel_cli.commands.simulate import simulate
+from simpel_cli.config import launch
+from simpel_cli.records import write_text
+from tests.reproduce.panel import CONF, Fit, Table, advantage, collect, draw, markdown, methods_of, run, sizes_of
+from tests.reproduce.static import folder
+
+METHODS = ("simpel", "simpel_only_sim", "fsvgd", "svgd", "greybox", "sysid", "gp")
+TESTS = 1000
+LEAST = 0.3  # nats that count as on par
+
+
+class System(NamedTuple):
+    """A system of the panel.
+
+    Args:
+        truth: simulator that the data come from.
+        sizes: training sizes, full.
+        small: those of the small variant.
+        noise: state -> standard deviation.
+        initial: state -> range, where it is not the declared one.
+        steps: full.
+    """
+
+    truth: str
+    sizes: tuple[int, ...]
+    small: tuple[int, ...]
+    noise: dict[str, float]
+    initial: dict[str, tuple[float, float]]
+    steps: int = 5000
+
+
+CAR = {"x": 1.110899654e-3, "y": 1.110899654e-3, "theta": 1.831563889e-3, "vx": 8.208499862e-3, "vy": 8.208499862e-3,
+       "omega": 3.678794412e-2}  # fmt: skip
+SYSTEMS = {
+    "pendulum": System(
+        "pendulum_high_fidelity", (10, 20, 40, 80, 160, 320, 640, 1280), (10, 40, 160), {"phi": 0.01, "omega": 0.05}, {}
+    ),
+    "sergio": System(
+        "sergio_high_fidelity", (50, 100, 200, 400, 800, 1600, 3200, 6400), (50, 200, 800),
+        {f"{part}_{g + 1}": 0.05 for part in ("mu", "s") for g in range(10)}, {}, 20000,
+    ),
+    "greenhouse": System(
+        "greenhouse_high_fidelity", (50, 100, 200, 400, 800, 1600, 3200), (50, 200, 800),
+        {"T_g": 0.34, "T_p": 0.14, "T_s": 0.010, "C": 0.042, "V": 2.5e-4, "B": 9.5e-3, "W_F": 1.7e-3, "W_L": 1.1e-3,
+         "D": 2.7e-6}, {},
+    ),
+    "racecar": System(
+        "racecar_high_fidelity", (50, 100, 200, 400, 800, 1600, 3200, 6400), (50, 200, 800), CAR,
+        {"x": (-2, 2), "y": (-2, 2), "vx": (-2, 2), "vy": (-2, 2), "omega": (-3, 3)},
+    ),
+}  # fmt: skip
+
+
+def listed(values: dict[str, object]) -> str:
+    """Return a mapping as Hydra reads it."""
+    return "{" + ",".join(f"{k}:{list(v) if isinstance(v, tuple) else v}" for k, v in values.items()) + "}"
+
+
+def measurements(name: str, data_seed: int, most: int, out: Path) -> Path:
+    """Simulate the data of a system and seed, once."""
+    system, where = SYSTEMS[name], out / "data" / f"{name}_{data_seed}"
+    path = where / "measurements.parquet"
+    if not path.exists():
+        rows = TESTS + most
+        launch("simulate", simulate, [
+            f"sim={system.truth}", "simulation.layout=transitions", "simulation.noise_on=next", "simulation.episodes=1",
+            f"simulation.steps={rows}", f"simulation.test_fraction={TESTS / rows}", f"simulation.seed={data_seed}",
+            f"simulation.noise_std={listed(dict(system.noise))}", f"simulation.initial={listed(dict(system.initial))}",
+            f"out={where}", "run.quiet=true", f"hydra.run.dir={out}/data/runs/{name}_{data_seed}",
+        ], config_dir=CONF, flags=[])  # fmt: skip
+    return path
+
+
+def fits(
+    systems: list[str], methods: list[str], data_seeds: int, model_seeds: int, small: bool, share: float, out: Path
+) -> list[Fit]:
+    """Return every fit of the panel; neighbours share the compiled program."""
+    every = []
+    for name in systems:
+        system = SYSTEMS[name]
+        for method in methods:
+            steps = max(1, round((5000 if small else system.steps) * share))
+            key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
+            for n in system.small if small else system.sizes:
+                for data_seed in range(data_seeds):
+                    path = measurements(name, data_seed, max(system.small if small else system.sizes), out).resolve()
+                    words = [
+                        f"sim={name}", "data=panel", f"data.path={path}", f"data.noise_std={listed(dict(system.noise))}",
+                        f"data.n_train={n}", f"data.seed={data_seed}", f"method={method}", f"run.name={name}",
+                        f"run.seeds={model_seeds}",
+                    ]  # fmt: skip
+                    every.append(Fit(name, method, n, data_seed, (*words, *([f"{key}={steps}"] if key else []))))
+    return every
+
+
+def claims(table: Table, systems: list[str]) -> list[str]:
+    """Check the paper's claims one by one."""
+    lines = []
+
+    def told(claim: str, good: bool, why: str) -> None:
+        lines.append(f"* {'holds' if good else 'DOES NOT HOLD'}: {claim} ({why})")
+
+    for name in systems:
+        sizes = sizes_of(table, name)
+        networks = [m for m in methods_of(table, name) if m not in ("simpel", "simpel_only_sim", "gp")]  # of the paper
+
+        def behind(n: int, name: str = name, networks: list[str] = networks) -> tuple[float, float, str]:
+            best = min((table[name, m, n].mean, m) for m in networks)[1]
+            gain, half = advantage(table, name, "simpel", best, n)
+            return gain, half, best
+
+        few = sizes[:2]
+        found = [behind(n) for n in few]
+        good = all(gain >= -table[name, "simpel", n].spread for n, (gain, _, _) in zip(few, found, strict=True))
+        told(
+            f"{name}: SimPEL is best, or within one standard deviation of the best baseline, at the two smallest sizes", good,
+            "; ".join(f"n = {n}: {g:+.2f} ± {h:.2f} nats ahead of {m}" for n, (g, h, m) in zip(few, found, strict=True)),
+        )  # fmt: skip
+        gain, half, best = behind(sizes[-1])
+        told(
+            f"{name}: SimPEL is on par with the best baseline (within {LEAST} nats) at the largest size", gain >= -LEAST,
+            f"n = {sizes[-1]}: {gain:+.2f} ± {half:.2f} nats ahead of {best}",
+        )  # fmt: skip
+        if "simpel_only_sim" in methods_of(table, name):
+            gains = [advantage(table, name, "simpel", "simpel_only_sim", n) for n in sizes]
+            why = "; ".join(f"n = {n}: {g:+.2f} ± {h:.2f} nats ahead" for n, (g, h) in zip(sizes, gains, strict=True))
+            if name == "pendulum":
+                told(f"{name}: the simulator alone is worse than SimPEL at the largest size", gains[-1][0] > LEAST, why)
+            else:
+                told(f"{name}: the simulator alone is as good as SimPEL", all(abs(g) <= LEAST for g, _ in gains), why)
+        if "gp" in methods_of(table, name):
+            ahead = [advantage(table, name, "simpel", "gp", n) for n in sizes]
+            lines.append(
+                f"* {name}, beside the paper: SimPEL against the exact GP about the calibrated simulator: "
+                + "; ".join(f"n = {n}: {g:+.2f} ± {h:.2f} nats ahead" for n, (g, h) in zip(sizes, ahead, strict=True))
+            )
+    return lines
+
+
+def main() -> None:
+    """Fit, draw and judge."""
+    parser = argparse.ArgumentParser(prog="tests.reproduce.panel_a", description=__doc__)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--size", choices=("small", "full"), default="small")
+    parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--data-seeds", type=int)
+    parser.add_argument("--model-seeds", type=int)
+    parser.add_argument("--steps", type=float, default=1.0, help="share of the number of steps")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    small = options.size == "small"
+    out = folder(options.out, f"panel_a_{options.size}")
+    every = fits(
+        options.systems, options.methods, options.data_seeds or (2 if small else 5), options.model_seeds or (2 if small else 5),
+        small, options.steps * (0.5 if small else 1.0), out,
+    )  # fmt: skip
+    run(every, out, options.processes)
+    tables = collect(every, out, "panel_a")
+    table = tables["nll"]
+    systems = [name for name in options.systems if sizes_of(table, name)]
+    draw(out / "panel_a.png", [(name, "nll", table) for name in systems], {"nll": "test NLL [nat]"}, columns=2)
+    lines = [
+        "Test NLL, joint over outputs: mean over data and model seeds ± standard deviation over model seeds.",
+        *claims(table, systems),
+    ]
+    text = "\n".join([*lines, *markdown(table, systems)]) + "\n"
+    write_text(out / "panel_a.md", text)
+    print(f"\n{text}\n{out / 'panel_a.png'}")
+
+
+if __name__ == "__main__":
+    main()
