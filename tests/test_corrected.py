@@ -16,6 +16,7 @@ from simulators.effects import Scales, Term
 
 CASES = {
     "rc_car": ("rolling_resistance", "traction_limit", "tyre_slip", "input_saturation"),
+    "racecar": ("rolling_resistance", "traction_limit", "input_saturation", "input_delay"),
     "pendulum": ("coulomb_friction", "added_inertia", "input_offset", "input_dead_zone"),
 }
 
@@ -42,7 +43,7 @@ def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch)
     search.terms, search.rows = tuple(terms), [tuple(r) for r in rows]
     nothing = Optimum(np.zeros(1), (), 0.0, 0.0, np.zeros(0), np.eye(1), np.zeros(0), np.eye(1), 0, True)
     trial = Trial(tuple(reversed(range(len(terms)))), nothing)
-    _, corrected, left_out = module.corrected(node, search, trial)
+    _, corrected, left_out = module.corrected(node, model, search, trial)
     return model, terms, build(corrected, "sim").model(), left_out
 
 

@@ -103,11 +103,12 @@ class Simulate:
             ModelError: a name that the source does not have, a range upside down, or a state that is not finite.
 
         """
+        own = OWN_COLUMNS if self.layout == "trajectories" else OWN_COLUMNS[-1:]
         for quantity in (*source.states, *source.inputs, *source.outputs):
-            if quantity.name in OWN_COLUMNS:
+            if quantity.name in own:
                 raise ModelError(
-                    f"simulation: {source.name} calls a quantity `{quantity.name}`, as one of the columns "
-                    f"{', '.join(OWN_COLUMNS)} is called; choose another name"
+                    f"simulation: {source.name} calls a quantity `{quantity.name}`, as a column of its own is called "
+                    f"({', '.join(own)}); choose another name, or simulation.layout=transitions, which has no time"
                 )
         measurable = (*source.states, *source.outputs)
         _known("noise_std", self.noise_std, measurable)
@@ -258,7 +259,9 @@ class Simulate:
         return np.where(groups >= n - n_test, "test", "train")
 
     def _card(self, source: Model | World, truth: np.ndarray, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-        units = {"t": "s"} | {q.name: q.unit for q in (*source.states, *source.inputs, *source.outputs)}
+        units = ({"t": "s"} if self.layout == "trajectories" else {}) | {
+            q.name: q.unit for q in (*source.states, *source.inputs, *source.outputs)
+        }
         excitation = {"law": type(self.excitation).__name__}
         if dataclasses.is_dataclass(self.excitation):
             excitation |= dataclasses.asdict(self.excitation)

@@ -1,0 +1,104 @@
+"""A simulator with terms added to it: what `simpel discover` writes where the equations are in Python, not in YAML."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from simulators.expression import Symbol
+from simulators.model import Model, ModelError, column
+from simulators.quantity import TIMES, Quantity, read_number, read_term, read_times, read_uncertain, refuse_unknown
+
+
+class Base(Protocol):
+    """Whatever a `sim:` node declares."""
+
+    def model(self) -> Any:
+        """Return the model."""
+
+
+@dataclass(frozen=True)
+class Extended:
+    """A simulator with further parameters and terms.
+
+    A transition is then integrated in the states, also where the simulator alone has coordinates of its own.
+
+    Args:
+        name: letters, digits and single underscores.
+        base: node of the simulator that the terms are added to.
+        parameters: name: {unit, range, prior} or a number.
+        inputs: input: {value: expression in its place, delay, lag}, each if there is one; see `Declared`.
+        dynamics: state: expression that is added to its rate, in states, inputs, parameters, and rate_STATE for the rate that
+            the simulator itself has.
+
+    Raises:
+        ModelError: names the key, what it holds, what is allowed and the cure.
+
+    """
+
+    name: str
+    base: Base
+    parameters: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, Any] = field(default_factory=dict)
+    dynamics: dict[str, Any] = field(default_factory=dict)
+
+    def model(self) -> Model:
+        """Check everything and build the model."""
+        base = self.base.model()
+        if not isinstance(base, Model):
+            raise ModelError(
+                "sim.base: a world shows no equations that terms could be added to; give a simulator in symbols"
+            )
+        taken = {q.name for q in (*base.states, *base.inputs, *base.params, *base.outputs)} | base.fixed.keys()
+        own: list[Quantity] = []
+        fixed: dict[str, float] = {}
+        for name, node in self.parameters.items():
+            path = f"sim.parameters.{name}"
+            if name in taken:
+                raise ModelError(f"{path}: the name is taken by sim.base; choose another name")
+            if isinstance(node, Mapping):
+                own.append(read_uncertain(path, name, node))
+            else:
+                fixed[name] = read_number(path, node)
+        _known("inputs", self.inputs, base.inputs)
+        _known("dynamics", self.dynamics, base.states)
+        params = (*base.params, *own)
+        values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
+
+        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            scope: dict[str, Symbol] = {name: base.symbol(value) for name, value in (base.fixed | fixed).items()}
+            for group, rows in ((base.states, x), (base.inputs, u), (params, p)):
+                scope |= {q.name: rows[i] for i, q in enumerate(group)}
+            for name, formula in values.items():
+                scope[name] = read_term(f"sim.inputs.{name}.value", formula, scope)
+            return scope
+
+        def given(scope: dict[str, Symbol]) -> Symbol:
+            return column(base.symbol, [scope[q.name] for q in base.inputs])
+
+        def rhs(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
+            scope = known(x, u, p)
+            rates = base.rhs(x, given(scope), p[: len(base.params)])
+            scope |= {f"rate_{q.name}": rates[i] for i, q in enumerate(base.states)}
+            added = {name: read_term(f"sim.dynamics.{name}", text, scope) for name, text in self.dynamics.items()}
+            return column(base.symbol, [rates[i] + added.get(q.name, 0) for i, q in enumerate(base.states)])
+
+        late = {key: getattr(base, key) | read_times(key, self.inputs, params, base.fixed | fixed) for key in TIMES}
+        model = replace(
+            base,
+            name=self.name,
+            params=params,
+            rhs=rhs,
+            output=lambda x, u, p: base.output(x, given(known(x, u, p)), p[: len(base.params)]),
+            fixed=base.fixed | fixed,
+            coordinates=None if self.dynamics or values else base.coordinates,
+            **late,
+        )
+        model.function()  # reads every expression once, so that an error surfaces here and not at first use
+        return model
+
+
+def _known(section: str, given: Mapping[str, Any], quantities: tuple[Quantity, ...]) -> None:
+    names = [q.name for q in quantities]
+    for name in given:
+        if name not in names:
+            refuse_unknown(f"sim.{section}.{name}", "sim.base has no such name", name, names)
