@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 State = Float[Array, " ds"]
@@ -29,8 +30,25 @@ def rk4(derivative: Callable[[State], State], x: State, dt: float, substeps: int
     return jax.lax.scan(lambda x, _: (rk4_step(derivative, x, h), None), x, None, length=substeps)[0]
 
 
-def rk4_step(derivative: Callable[[State], State], x: State, h: float) -> State:
-    """Make one classical Runge-Kutta step of length h, s."""
+def rk4_step(derivative: Callable[[State], State], x: State, h: float, *, scanned: bool = False) -> State:
+    """Make one classical Runge-Kutta step of length h, s.
+
+    Args:
+        derivative: right-hand side, state units per second.
+        x: state at the start.
+        h: length of the step, s.
+        scanned: put the four stages into a loop, so that a long right-hand side is compiled once: XLA fuses four copies of
+            hundreds of operations for minutes where derivatives are asked for. A tenth slower.
+    """
+    if scanned:
+        stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], x.dtype) * h
+
+        def stage(carry: tuple[State, State], weights: Array) -> tuple[tuple[State, State], None]:
+            total, slope = carry
+            slope = derivative(x + weights[0] * slope)
+            return (total + weights[1] * slope, slope), None
+
+        return jax.lax.scan(stage, (x, jnp.zeros_like(x)), stages)[0][0]
     k1 = derivative(x)
     k2 = derivative(x + h / 2 * k1)
     k3 = derivative(x + h / 2 * k2)

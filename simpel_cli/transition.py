@@ -20,6 +20,8 @@ from simpel_cli.signals import arriving
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
 
+LONG = 200  # scalar instructions of a right-hand side that is compiled once and not once per stage
+
 OneStep = Callable[[Float[Array, " dx"], Float[Array, " dp"]], Float[Array, " dy"]]
 
 
@@ -113,12 +115,13 @@ def _integrated(
         where = _reached(flow.enter, states, params)
         enter, leave = checked(flow.enter, [states, params]), checked(flow.leave, [where, params])
     rhs = checked(flow.rhs, [where, inputs, params])
+    long = flow.rhs.class_name() == "SXFunction" and flow.rhs.n_instructions() > LONG
 
     def integrated(state: State, u: Float[Array, "substeps du"], phi: Float[Array, " dp"]) -> State:
         low, high = (jnp.array(ends, state.dtype) for ends in (flow.low, flow.high))
 
         def one(z: State, u: Float[Array, " du"]) -> tuple[State, None]:
-            after = rk4_step(lambda z: rhs(z, u, phi)[0], z, h)
+            after = rk4_step(lambda z: rhs(z, u, phi)[0], z, h, scanned=long)
             return jnp.clip(after, low, high) if flow.limited else after, None
 
         z = enter(state, phi)[0] if enter is not None else state

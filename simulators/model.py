@@ -152,7 +152,7 @@ class Model:
         own = self.coordinates
         if own is None:
             rhs = casadi.Function(f"{self.name}_rhs", [x, u, p], [self.rhs(x, u, p)], ["x", "u", "p"], ["dx"])
-            low, high = zip(*(self.limits.get(q.name, UNLIMITED) for q in self.states), strict=True)
+            low, high = (tuple(self.limits.get(q.name, UNLIMITED)[end] for q in self.states) for end in (0, 1))
             return Flow(None, rhs, None, low, high)
         z = self.symbol.sym("z", own.size, 1)
         return Flow(

@@ -9,7 +9,7 @@ import yaml
 from scipy.stats import kstest
 
 from simulators.model import Declared, Model, ModelError, Quantity
-from simulators.worlds.excitation import Excitation, HeldRandom, Multisine, Zero
+from simulators.worlds.excitation import Excitation, HeldRandom, Multisine, OrnsteinUhlenbeck, Zero
 from simulators.worlds.mujoco_world import MujocoWorld
 from simulators.worlds.rk4 import RK4
 from simulators.worlds.simulate import Simulate
@@ -286,3 +286,111 @@ def test_a_multisine_has_its_frequencies_only_and_touches_the_range() -> None:
 def test_errors_name_the_key_and_the_cure(make: Any, fragment: str) -> None:
     with pytest.raises(ModelError, match=fragment):
         make()
+
+
+def test_transitions_are_rows_of_their_own() -> None:
+    """c(dt) of c' = -k c + b u in closed form; noise on the next state only; the exact one beside it."""
+    truth = {"k": 1.3, "b": 0.4}
+    made = Simulate(
+        episodes=1,
+        steps=4000,
+        layout="transitions",
+        noise_on="next",
+        noise_std={"c": 0.05},
+        truth=truth,
+        initial={"c": [1, 1.5]},
+    ).run(decay())
+    columns = made.columns
+    assert [*columns] == ["c", "next_c", "exact_next_c", "u", "q", "split"]
+    c, u = columns["c"], columns["u"]
+    keep = np.exp(-0.13)
+    np.testing.assert_allclose(columns["exact_next_c"], c * keep + 0.4 * u / 1.3 * (1 - keep), rtol=1e-9)
+    assert kstest((c - 1) / 0.5, "uniform").pvalue > 1e-3
+    assert kstest((u + 1) / 4, "uniform").pvalue > 1e-3
+    assert abs(np.corrcoef(c[1:], columns["exact_next_c"][:-1])[0, 1]) < 0.1  # rows do not follow each other
+    assert kstest((columns["next_c"] - columns["exact_next_c"]) / 0.05, "norm").pvalue > 1e-3
+    np.testing.assert_allclose(columns["q"], 2 * c + u)
+    assert made.card["columns"]["exact_next_c"] == {"unit": "mol"}
+    assert (made.card["layout"], made.card["noise_on"]) == ("transitions", "next")
+    assert "t" not in made.card["columns"]
+
+
+def test_noise_on_both_states_is_drawn_apart() -> None:
+    both = Simulate(episodes=1, steps=2000, layout="transitions", noise_std={"c": 0.05}).run(decay()).columns
+    exact = (
+        Simulate(episodes=1, steps=2000, layout="transitions", noise_std={"c": 0.05}, noise_on="next")
+        .run(decay())
+        .columns
+    )
+    before, after = both["c"] - exact["c"], both["next_c"] - both["exact_next_c"]
+    np.testing.assert_array_equal(both["next_c"], exact["next_c"])
+    assert before.std() == pytest.approx(0.05, rel=0.1)
+    assert abs(np.corrcoef(before, after)[0, 1]) < 0.1
+
+
+def test_more_transitions_begin_with_the_fewer_ones() -> None:
+    few, many = (
+        Simulate(episodes=1, steps=n, layout="transitions", noise_std={"c": 0.05}, test_fraction=0).run(decay()).columns
+        for n in (50, 80)
+    )
+    for name, values in few.items():
+        np.testing.assert_array_equal(many[name][:50], values)
+
+
+def test_unmeasured_states_have_no_column_before_or_after() -> None:
+    made = Simulate(episodes=1, steps=20, layout="transitions", unmeasured=("w",), test_fraction=0).run(turntable())
+    assert [*made.columns] == ["a", "next_a", "exact_next_a"]
+    assert np.abs(made.columns["exact_next_a"]).max() <= np.pi
+
+
+@pytest.mark.parametrize(("key", "value"), [("layout", "rows"), ("noise_on", "first")])
+def test_words_of_the_layout(key: str, value: str) -> None:
+    with pytest.raises(ModelError, match=rf"simulation\.{key}: '{value}' is not allowed, only"):
+        Simulate(**{key: value})
+
+
+def test_a_time_of_its_own_needs_rows_without_time() -> None:
+    timed = decay(inputs={"t": {"unit": "s", "range": [0, 1]}}, dynamics={"c": "-k*c + b*t"}, outputs={})
+    with pytest.raises(ModelError, match=r"a quantity `t`, as a column of its own is called .*layout=transitions"):
+        Simulate(episodes=2, steps=3).run(timed)
+    assert "t" in Simulate(episodes=1, steps=3, layout="transitions").run(timed).columns
+
+
+def test_trajectories_follow_late_inputs() -> None:
+    """v' = u(t - 0.25 s) from rest: position by hand, the first input held before the record."""
+    late = Declared(
+        "late", dt=0.1, substeps=1, states={"v": {"unit": "m/s", "range": [0, 0.1]}},
+        inputs={"u": {"unit": "V", "range": [-1, 1], "delay": "d"}},
+        parameters={"d": {"unit": "s", "range": [0.25, 0.2500001]}}, dynamics={"v": "u"},
+    ).model()  # fmt: skip
+    made = Simulate(episodes=2, steps=30, initial={"v": [0, 0]}, truth={"d": 0.25}).run(late).columns
+    u, v = made["u"].reshape(2, 30), made["v"].reshape(2, 30)
+    before = np.concatenate([np.repeat(u[:, :1], 3, axis=1), u], axis=1)
+    pushed = 0.05 * (before[:, :29] + before[:, 1:30])  # half of a row each: three rows ago, then two
+    np.testing.assert_allclose(v[:, 1:], np.cumsum(pushed, axis=1), atol=1e-12)
+
+
+def test_driver_is_pulled_to_means_that_change() -> None:
+    """Stationary variance of the discrete process, s^2/(1 - (1 - a)^2), about a mean that is held."""
+    law = OrnsteinUhlenbeck(pull=2.0, noise=0.1, hold=1e6, means={"u": 0.5})
+    signal = law.signal(np.random.default_rng(3), 200_000, 0.05, U)
+    unit = (signal - 1.0) / 2.0  # halves of the range about its middle
+    a = 0.1
+    assert unit.std() == pytest.approx(0.1 * np.sqrt(0.05) / np.sqrt(1 - (1 - a) ** 2), rel=0.05)
+    assert abs(unit.mean()) <= 0.5
+    short = law.signal(np.random.default_rng(3), 100, 0.05, U)
+    np.testing.assert_array_equal(short, signal[:100])
+
+
+def test_driver_changes_its_mind_and_stays_within_the_range() -> None:
+    law = OrnsteinUhlenbeck(means={"u": 1.0})
+    signal = law.signal(np.random.default_rng(0), 20_000, 1 / 30, U)
+    assert signal.min() >= -1
+    assert signal.max() <= 3
+    means = signal.reshape(-1, 40)[:, 20:].mean(axis=1)  # of the second halves of the holds
+    assert means.std() > 0.5
+    assert abs(np.corrcoef(means[1:], means[:-1])[0, 1]) < 0.2
+    with pytest.raises(ModelError, match=r"excitation\.means\.u: 2 is not allowed; give 0 to 1"):
+        OrnsteinUhlenbeck(means={"u": 2.0})
+    with pytest.raises(ModelError, match=r"excitation\.pull: 0 is not positive"):
+        OrnsteinUhlenbeck(pull=0)

@@ -88,15 +88,24 @@ class SysID:
         def sigma(rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
             return self.noise.std(rho, problem.noise_floor)
 
-        def loss(u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
-            e = (problem.y - simulated(u, jnp.asarray(problem.x))) / sigma(rho)[None]
+        def judged(f: Float[Array, "n dy"], u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
+            """Return the loss of simulated targets f."""
+            e = (problem.y - f) / sigma(rho)[None]
             data = jnp.sum(counts * (0.5 * e**2 + jnp.log(sigma(rho))[None]))
             learned = self.noise.log_prior(rho, problem.noise_init, problem.noise_floor) if self.noise.learn else 0.0
             return data + 0.5 * jnp.sum(jnp.where(gaussian, u**2, 0.0)) - learned
 
-        def fisher(u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, "d d"]:
+        def loss(u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
+            return judged(simulated(u, jnp.asarray(problem.x)), u, rho)
+
+        def linearised(u: Float[Array, " dp"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy dp"]]:
+            """Return simulated targets and their derivatives: forwards only, which compiles sooner than backwards."""
+            f, along = jax.linearize(lambda u: simulated(u, jnp.asarray(problem.x)), u)
+            return f, jax.vmap(along, out_axes=-1)(jnp.eye(dim_u, dtype=dtype))
+
+        def fisher(slope: Float[Array, "n dy dp"], rho: Float[Array, " dy"]) -> Float[Array, "d d"]:
             """Information of unit coordinates and noise."""
-            slope = jax.jacfwd(simulated)(u, jnp.asarray(problem.x)) / sigma(rho)[None, :, None]
+            slope = slope / sigma(rho)[None, :, None]
             of_u = jnp.einsum("nki,nkj->ij", slope * counts[:, :, None], slope) + jnp.diag(gaussian.astype(dtype))
             of_log = 2 * problem.m.astype(dtype) + 1 / self.noise.prior_std**2
             bend = jax.nn.sigmoid(rho) / sigma(rho)  # d log sigma / d rho
@@ -105,7 +114,9 @@ class SysID:
         def better(state: State) -> State:
             """One damped step of one start."""
             at = jnp.concatenate([state.u, state.rho])
-            slope = jnp.concatenate(jax.grad(loss, argnums=(0, 1))(state.u, state.rho))
+            f, of_f = linearised(state.u)
+            by_f, by_u, by_rho = jax.grad(judged, argnums=(0, 1, 2))(f, state.u, state.rho)
+            slope = jnp.concatenate([by_u + jnp.einsum("nk,nki->i", by_f, of_f), by_rho])
             edge = (
                 jnp.concatenate([low, jnp.full((dim_y,), -jnp.inf, dtype)]),
                 jnp.concatenate([high, jnp.full((dim_y,), jnp.inf, dtype)]),
@@ -113,7 +124,7 @@ class SysID:
             stuck = ((at <= edge[0]) & (slope > 0)) | ((at >= edge[1]) & (slope < 0))
             still = stuck | (jnp.arange(at.shape[0]) >= dim_u) if not self.noise.learn else stuck
             moves = jnp.where(still, 0.0, 1.0).astype(dtype)
-            h = fisher(state.u, state.rho) * moves[:, None] * moves[None]
+            h = fisher(of_f, state.rho) * moves[:, None] * moves[None]
             h = h + jnp.diag(state.damping * jnp.diag(h) + jnp.where(still, 1.0, 1e-9 * jnp.trace(h) + 1e-12))
             new = jnp.clip(at - jnp.linalg.solve(h, slope * moves), *edge)
             value = loss(new[:dim_u], new[dim_u:])
@@ -155,7 +166,7 @@ class SysID:
             best = jnp.argmin(state.loss)
             u, rho = state.u[best], state.rho[best]
             # a uniform prior knows its variance of 1/12: where data see nothing, a draw is spread over the range
-            h = fisher(u, rho)[:dim_u, :dim_u] + jnp.diag(jnp.where(gaussian, 0.0, 12.0).astype(dtype))
+            h = fisher(linearised(u)[1], rho)[:dim_u, :dim_u] + jnp.diag(jnp.where(gaussian, 0.0, 12.0).astype(dtype))
             held = (u <= low) | (u >= high)  # at a bound half of the mass lies beyond it: the optimum stands for it
             h = jnp.where(held[:, None] | held[None], jnp.eye(dim_u, dtype=dtype), h)
             factor = jnp.linalg.cholesky(h.astype(jnp.float64)).astype(dtype)

@@ -32,6 +32,8 @@ class System(NamedTuple):
         noise: state -> standard deviation.
         initial: state -> range, where it is not the declared one.
         steps: full.
+        wide: many states: networks need more points of the box than 256 in 500 steps, and Newton's direction; what a draw of the
+            simulator costs is saved on the number of draws.
     """
 
     truth: str
@@ -40,8 +42,16 @@ class System(NamedTuple):
     noise: dict[str, float]
     initial: dict[str, tuple[float, float]]
     steps: int = 5000
+    wide: bool = False
 
 
+WIDE = {
+    "simpel": ("prior.draws=256", "method.pool=1024", "method.sets=128", "method.fresh_points=32", "method.precondition=true"),
+    "fsvgd": ("method.pool=1024", "method.sets=128", "method.fresh_points=32", "method.precondition=true"),
+    "greybox": ("method.residual.pool=1024", "method.residual.sets=128", "method.residual.fresh_points=32",
+                "method.residual.precondition=true"),
+}  # fmt: skip
+WIDE["simpel_only_sim"] = WIDE["simpel"]
 CAR = {"x": 1.110899654e-3, "y": 1.110899654e-3, "theta": 1.831563889e-3, "vx": 8.208499862e-3, "vy": 8.208499862e-3,
        "omega": 3.678794412e-2}  # fmt: skip
 SYSTEMS = {
@@ -50,7 +60,7 @@ SYSTEMS = {
     ),
     "sergio": System(
         "sergio_high_fidelity", (50, 100, 200, 400, 800, 1600, 3200, 6400), (50, 200, 800),
-        {f"{part}_{g + 1}": 0.05 for part in ("mu", "s") for g in range(10)}, {}, 20000,
+        {f"{part}_{g + 1}": 0.05 for part in ("mu", "s") for g in range(10)}, {}, 5000, True,
     ),
     "greenhouse": System(
         "greenhouse_high_fidelity", (50, 100, 200, 400, 800, 1600, 3200), (50, 200, 800),
@@ -93,6 +103,7 @@ def fits(
         system = SYSTEMS[name]
         for method in methods:
             steps = max(1, round((5000 if small else system.steps) * share))
+            more = WIDE.get(method, ()) if system.wide else ()
             key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
             for n in system.small if small else system.sizes:
                 for data_seed in range(data_seeds):
@@ -102,7 +113,7 @@ def fits(
                         f"data.n_train={n}", f"data.seed={data_seed}", f"method={method}", f"run.name={name}",
                         f"run.seeds={model_seeds}",
                     ]  # fmt: skip
-                    every.append(Fit(name, method, n, data_seed, (*words, *([f"{key}={steps}"] if key else []))))
+                    every.append(Fit(name, method, n, data_seed, (*words, *([f"{key}={steps}"] if key else []), *more)))
     return every
 
 
