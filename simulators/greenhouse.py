@@ -29,7 +29,7 @@ from simulators.model import ModelError
 
 CLIMATE = ("T_g", "T_p", "T_s", "C", "V")
 CROP = ("B", "W_F", "W_L", "D")
-WEATHER = ("T_o", "T_d", "C_o", "V_o", "w", "G", "t")
+WEATHER = ("T_o", "T_d", "C_o", "V_o", "w", "G", "age")
 CONTROLS = ("T_h", "r_l", "r_w", "phi_c")
 
 VENTILATION = ("sigma", "chi", "zeta", "xi", "psi")
@@ -56,12 +56,12 @@ class Greenhouse(Built):
 
     Args:
         fidelity: `low` or `high`, see above.
-        weather: `inputs`: T_o to t are inputs, held over a transition; `states`: they are states, constant but for t' = 1.
+        weather: `inputs`: T_o to age are inputs, held over a transition; `states`: they are states, constant but for age' = 1.
         states: T_g, T_p, T_s of air, pipe and soil (degC), C (CO2, g/m^3), V (humidity, kg/m^3), B (assimilate buffer,
             g/m^2), W_F, W_L (dry mass of fruit and leaves, g/m^2), D (development stage, 0..1).
         inputs: T_h (heating water, degC), r_l, r_w (leeward and windward window opening, %), phi_c (CO2 dosing, mg/(m^2 s)).
             Weather: T_o, T_d outdoors and deep in the soil (degC), C_o (g/m^3), V_o (kg/m^3), w (wind, m/s), G (radiation,
-            W/m^2), t (time since planting, s).
+            W/m^2), age (time since planting, s).
         parameters: of both fidelities (no unit: a number)
             ventilation: sigma, chi, xi (1/%), zeta, psi (m/s).
             heat: rho_a (kg/m^3), c_a (J/(kg K)), nu (W/(m^2 K^1.25)), tau (K^0.5), c_g, c_s (J/(m^2 K)), k_r, k_s, k_d
@@ -100,7 +100,7 @@ class Greenhouse(Built):
     def rates(self, known: Known) -> list[Symbol]:
         """Return d(state)/dt."""
         climate = wet_climate(known) if self.fidelity == "high" else dry_climate(known)
-        constant = dict.fromkeys(WEATHER, casadi.SX(0)) | {"t": casadi.SX(1)}
+        constant = dict.fromkeys(WEATHER, casadi.SX(0)) | {"age": casadi.SX(1)}
         rate = climate | crop(known) | constant
         return [rate[name] for name in self.states]
 
@@ -250,7 +250,7 @@ def crop(k: Known) -> dict[str, Symbol]:
 
 def development(k: Known) -> Symbol:
     """Return d, 1/s: faster in warm air, slower with age; cold air has a floor, where the logarithm would have a pole."""
-    return k["d1"] + k["d2"] * casadi.log(casadi.fmax(k["T_g"] / k["d3"], 0.05)) - k["d4"] * k["t"] / DAY
+    return k["d1"] + k["d2"] * casadi.log(casadi.fmax(k["T_g"] / k["d3"], 0.05)) - k["d4"] * k["age"] / DAY
 
 
 def _power(x: Symbol, exponent: Symbol) -> Symbol:

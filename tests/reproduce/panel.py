@@ -82,13 +82,15 @@ def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
     cores = context.Queue()
     for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0))), processes):
         cores.put(core)
+    # data seeds share a compiled program: one worker takes them all, so that no two compile the same
+    groups = [list(group) for _, group in itertools.groupby(todo, lambda fit: fit[:3])]
+    done = 0
     with ProcessPoolExecutor(processes, mp_context=context, initializer=_pin, initargs=(cores,)) as pool:
-        # neighbours share system and method, and so the compiled program
-        running = {pool.submit(_fit, fit, out / fit.name): fit for fit in todo}
-        for done, future in enumerate(as_completed(running), 1):
-            fit, message = running[future], future.result()
-            left = (time.perf_counter() - began) / done * (len(todo) - done) / 60
-            print(f"{done}/{len(todo)}  {fit.name}  {message}  about {left:.0f} min left", flush=True)
+        for future in as_completed([pool.submit(_fit_all, group, out) for group in groups]):
+            for name, message in future.result():
+                done += 1
+                left = (time.perf_counter() - began) / done * (len(todo) - done) / 60
+                print(f"{done}/{len(todo)}  {name}  {message}  about {left:.0f} min left", flush=True)
 
 
 def _pin(cores: "multiprocessing.Queue[int]") -> None:
@@ -101,6 +103,10 @@ def _done(directory: Path) -> bool:
         return bool(read_manifest(directory)["status"] == "done")
     except SimpelError:
         return False
+
+
+def _fit_all(fits: Sequence[Fit], out: Path) -> list[tuple[str, str]]:
+    return [(fit.name, _fit(fit, out / fit.name)) for fit in fits]
 
 
 def _fit(fit: Fit, directory: Path) -> str:

@@ -32,8 +32,8 @@ class System(NamedTuple):
         noise: state -> standard deviation.
         initial: state -> range, where it is not the declared one.
         steps: full.
-        wide: many states: networks need more points of the box than 256 in 500 steps, and Newton's direction; what a draw of the
-            simulator costs is saved on the number of draws.
+        wide: many states: networks need more points of the box than 256 in 500 steps, and Newton's direction; what that costs
+            is saved on the number of draws.
     """
 
     truth: str

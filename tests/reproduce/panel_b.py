@@ -1,0 +1,131 @@
+"""The paper's panel (b): test NLL and error against training size on the recordings of an RC car.
+
+    SIMPEL_SHARED=FOLDER python -m tests.reproduce.panel_b --size small --out runs/reproduce/panel_b
+
+Runs train_1 and train_2 are trained on (rows at random, by data seed), all rows of test_1 are tested on: no neighbour of a
+test row is trained on. Seven past commands go into every network. Low fidelity: a kinematic bicycle without delay. High
+fidelity: Pacejka tyres and commands that act late.
+"""
+
+import argparse
+from pathlib import Path
+
+from simpel_cli.records import write_text
+from tests.reproduce.panel import Fit, Table, advantage, collect, draw, markdown, methods_of, run, sizes_of
+from tests.reproduce.static import folder
+
+SYSTEM = "rc_car"
+LOW, HIGH = "rc_car", "rc_car_high_fidelity"
+METHODS = {  # name -> (method of simpel, simulator)
+    "simpel": ("simpel", LOW),
+    "simpel_only_sim": ("simpel_only_sim", LOW),
+    "simpel, high fidelity": ("simpel_high_fidelity", HIGH),
+    "simpel_only_sim, high fidelity": ("simpel_only_sim", HIGH),
+    "fsvgd": ("fsvgd", LOW),
+    "svgd": ("svgd", LOW),
+    "greybox": ("greybox", LOW),
+    "greybox, high fidelity": ("greybox", HIGH),
+    "sysid": ("sysid", LOW),
+    "sysid, high fidelity": ("sysid", HIGH),
+    "gp": ("gp", LOW),
+}
+SIZES = (50, 100, 200, 400, 800, 1600, 3200, 6400)
+SMALL = (50, 400, 3200)
+
+
+def fits(methods: list[str], data_seeds: int, model_seeds: int, small: bool, share: float) -> list[Fit]:
+    """Return every fit of the panel."""
+    every = []
+    for name in methods:
+        method, sim = METHODS[name]
+        key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
+        for n in SMALL if small else SIZES:
+            # as published: 60 passes of 8 rows beside 5000 steps
+            steps = (
+                max(1, round(share * min(60 * n // 8 + 5000, 100_000))) if not small else max(1, round(5000 * share))
+            )
+            for data_seed in range(data_seeds):
+                words = [
+                    "experiment=rc_car", f"sim={sim}", f"method={method}", f"data.n_train={n}", f"data.seed={data_seed}",
+                    "run.name=rc_car", f"run.seeds={model_seeds}", *([f"{key}={steps}"] if key else []),
+                ]  # fmt: skip
+                place = name.replace(", ", "_").replace(" ", "_")
+                every.append(Fit(SYSTEM, place, n, data_seed, tuple(words)))
+    return every
+
+
+def claims(nll: Table, error: Table) -> list[str]:
+    """Check the paper's claims one by one."""
+    lines = []
+    sizes, methods = sizes_of(nll, SYSTEM), methods_of(nll, SYSTEM)
+
+    def told(claim: str, good: bool, why: str) -> None:
+        lines.append(f"* {'holds' if good else 'DOES NOT HOLD'}: {claim} ({why})")
+
+    own = [m for m in methods if m.startswith("simpel")]
+    baselines = [m for m in ("fsvgd", "svgd", "greybox", "sysid") if m in methods]
+    for words, table in (("NLL", nll), ("normalised RMSE", error)):
+        rows = []
+        good = True
+        for n in sizes:
+            best = min((table[SYSTEM, m, n].mean, m) for m in baselines)[1]
+            gain, half = advantage(table, SYSTEM, "simpel", best, n)
+            good = good and gain >= -table[SYSTEM, "simpel", n].spread
+            rows.append(f"n = {n}: {gain:+.3g} ± {half:.2g} ahead of {best}")
+        told(
+            f"SimPEL with the low-fidelity prior has the best {words} at every size, or lies within one standard deviation",
+            good,
+            "; ".join(rows),
+        )
+    if "simpel_only_sim" in own:
+        gain, half = advantage(error, SYSTEM, "simpel", "simpel_only_sim", sizes[-1])
+        told(
+            "the simulator alone matches SimPEL's error at the largest size, within a tenth",
+            gain <= 0.1 * error[SYSTEM, "simpel", sizes[-1]].mean,
+            f"n = {sizes[-1]}: {gain:+.3g} ± {half:.2g}",
+        )  # fmt: skip
+    if "simpel_high_fidelity" in own:
+        gains = [advantage(nll, SYSTEM, "simpel_high_fidelity", "simpel", n) for n in sizes]
+        told(
+            "the better simulator is the better prior where data are few", gains[0][0] > 0,
+            "; ".join(f"n = {n}: {g:+.2f} ± {h:.2f} nats" for n, (g, h) in zip(sizes, gains, strict=True)),
+        )  # fmt: skip
+    return lines
+
+
+def main() -> None:
+    """Fit, draw and judge."""
+    parser = argparse.ArgumentParser(prog="tests.reproduce.panel_b", description=__doc__)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--size", choices=("small", "full"), default="small")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--data-seeds", type=int)
+    parser.add_argument("--model-seeds", type=int)
+    parser.add_argument("--steps", type=float, default=1.0, help="share of the number of steps")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    small = options.size == "small"
+    out = folder(options.out, f"panel_b_{options.size}")
+    seeds = 2 if small else 5
+    every = fits(
+        options.methods,
+        options.data_seeds or seeds,
+        options.model_seeds or seeds,
+        small,
+        options.steps * (0.5 if small else 1.0),
+    )
+    run(every, out, options.processes)
+    tables = collect(every, out, "panel_b")
+    labels = {"nll": "test NLL [nat]", "nrmse": "test RMSE, normalised"}
+    draw(out / "panel_b.png", [(SYSTEM, metric, tables[metric]) for metric in labels], labels, columns=2)
+    lines = ["Test NLL, joint over outputs: mean over data and model seeds ± standard deviation over model seeds."]
+    lines += claims(tables["nll"], tables["nrmse"])
+    for metric, label in labels.items():
+        lines += ["", f"## {label}", *markdown(tables[metric], [SYSTEM])]
+    text = "\n".join(lines) + "\n"
+    write_text(out / "panel_b.md", text)
+    print(f"\n{text}\n{out / 'panel_b.png'}")
+
+
+if __name__ == "__main__":
+    main()
