@@ -10,12 +10,13 @@ WORKERS ?= 2
 WORDS ?= experiment=pendulum
 SETS ?= 600
 SEED ?= 1
-OUT ?= runs/exam/$$(date +%Y%m%d-%H%M%S)
+OUT ?= runs/$@/$$(date +%Y%m%d-%H%M%S)
+size ?= small
 # worlds whose effects no YAML of conf/ names
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal
+.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -57,6 +58,12 @@ sbc: install ## Calibrate the inference of an experiment on functions of its own
 bench-discover: install ## Measure time and memory of verdicts, compiled anew and cached (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.verdicts
 
+bench-simulators: install ## Measure what every simulator costs: conversion, compilation, a million transitions, memory
+	$(BIN)/python -m tests.benchmarks.simulators
+
+differences: install ## Let `simpel discover` find what the paper's low-fidelity simulators lack (OUT=DIR)
+	$(BIN)/python -m tests.benchmarks.differences --out $(OUT)
+
 exam: $(RIVALS) ## Give `simpel discover` and PySINDy the blind exam (SETS=600 SEED=1, OUT=DIR to go on, ONLY="cart car")
 	$(BIN)/python -m tests.exam --sets $(SETS) --seed $(SEED) --out $(OUT) $(if $(ONLY),--only $(ONLY))
 
@@ -78,12 +85,20 @@ reproduce-sinusoids: install ## Make the paper's figure of sinusoids: six fits o
 reproduce-bimodal: install ## Make the paper's figure of two modes: four score estimators, two also as published
 	$(BIN)/python -m tests.reproduce.bimodal
 
+reproduce-panel-a: install ## Make the paper's panel of four simulated systems (size=small or full; out=DIR to go on)
+	$(BIN)/python -m tests.reproduce.panel_a --size $(size) $(if $(out),--out $(out))
+
+reproduce-panel-b: install ## Make the paper's panel of the recorded RC car (size=small or full; needs SIMPEL_SHARED)
+	$(BIN)/python -m tests.reproduce.panel_b --size $(size) $(if $(out),--out $(out))
+
 lock: ## Write uv.lock against the public index only
 	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config
 
 data: install ## Make the measurements in data/ anew
-	rm -rf data/pendulum data/hidden_pendulum data/hidden_cart
+	rm -rf data/pendulum data/racecar data/greenhouse data/sergio data/hidden_pendulum data/hidden_cart
 	$(BIN)/simpel simulate simulation=pendulum out=data/pendulum
+	for system in racecar greenhouse sergio; do \
+		$(BIN)/simpel simulate sim=$${system}_high_fidelity simulation=$$system out=data/$$system || exit; done
 	$(BIN)/simpel simulate $(EXAM) sim=mujoco_pendulum simulation=hidden_pendulum out=data/hidden_pendulum
 	$(BIN)/simpel simulate $(EXAM) sim=mujoco_cart simulation=hidden_cart out=data/hidden_cart
 

@@ -72,7 +72,14 @@ def test_of_stacked_actions_the_last_acts() -> None:
     assert abs(slope[2, 2]) > 0.01  # a volt for 0.05 s, on I = 1 kg m^2
 
 
-@pytest.mark.parametrize("sim", SYMBOLIC)
+# a published setting has the equations of the other one
+EVERY = [
+    pytest.param(s, marks=[pytest.mark.slow] if "_published" in s and s != "pendulum_published" else [])
+    for s in SYMBOLIC
+]
+
+
+@pytest.mark.parametrize("sim", EVERY)
 def test_simulators_agree_with_casadi(sim: str) -> None:
     """Right-hand sides and outputs to 1e-12, their Jacobians to 1e-9, at points of the declared ranges."""
     m = model(sim)
@@ -99,7 +106,7 @@ def test_simulators_agree_with_casadi(sim: str) -> None:
     np.testing.assert_allclose(reverse, slopes, rtol=1e-9, atol=1e-9 * np.abs(slopes).max())
 
 
-@pytest.mark.parametrize("sim", SYMBOLIC)
+@pytest.mark.parametrize("sim", EVERY)
 def test_simulators_step_in_batches(sim: str) -> None:
     """Every symbolic simulator gives finite targets over its domain, and keeps angles on the unit circle."""
     m = model(sim)

@@ -59,8 +59,9 @@ class Cell(NamedTuple):
 
     @property
     def spread(self) -> float:
-        """Standard deviation over model seeds of the mean over data seeds, as the paper's bands have it."""
-        means = np.nanmean(self.values, axis=0)
+        """Standard deviation over model seeds of the mean over data seeds, as the paper's bands have it; of one model
+        seed that over data seeds."""
+        means = np.nanmean(self.values, axis=0 if self.values.shape[1] > 1 else 1)
         return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
     @property

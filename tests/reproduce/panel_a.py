@@ -170,14 +170,14 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--data-seeds", type=int)
     parser.add_argument("--model-seeds", type=int)
-    parser.add_argument("--steps", type=float, default=1.0, help="share of the number of steps")
+    parser.add_argument("--steps", type=float, help="share of the number of steps; small: 0.3")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     small = options.size == "small"
     out = folder(options.out, f"panel_a_{options.size}")
     every = fits(
-        options.systems, options.methods, options.data_seeds or (2 if small else 5), options.model_seeds or (2 if small else 5),
-        small, options.steps * (0.5 if small else 1.0), out,
+        options.systems, options.methods, options.data_seeds or (2 if small else 5), options.model_seeds or (1 if small else 5),
+        small, options.steps or (0.3 if small else 1.0), out,
     )  # fmt: skip
     run(every, out, options.processes)
     tables = collect(every, out, "panel_a")
