@@ -72,6 +72,18 @@ SYSTEMS = {
         {"x": (-2, 2), "y": (-2, 2), "vx": (-2, 2), "vy": (-2, 2), "omega": (-3, 3)},
     ),
 }  # fmt: skip
+WIDTH = {"T_g": 30, "T_p": 50, "T_s": 30, "C": 8, "V": 0.025, "B": 10, "W_F": 150, "W_L": 15, "D": 1, "T_o": 35, "T_d": 2,
+         "C_o": 0.5, "V_o": 0.0119, "w": 5, "G": 500, "age": 1e6}  # fmt: skip
+SHARE = dict.fromkeys(WIDTH, 0.05) | dict.fromkeys(("C", "D", "T_d"), 0.01) | {"C_o": 1e-3, "V_o": 1e-4}  # of the box
+PUBLISHED = {
+    name: system._replace(truth=f"{name}_published_high_fidelity") for name, system in SYSTEMS.items()
+} | {
+    "pendulum": SYSTEMS["pendulum"]._replace(truth="pendulum_published_high_fidelity", noise={"phi": 0.02, "omega": 0.02}),
+    "greenhouse": SYSTEMS["greenhouse"]._replace(
+        truth="greenhouse_published_high_fidelity", noise={name: SHARE[name] * width for name, width in WIDTH.items()}
+    ),
+}  # fmt: skip
+SETTINGS = {"informative": SYSTEMS, "published": PUBLISHED}
 
 
 def listed(values: dict[str, object]) -> str:
@@ -79,9 +91,9 @@ def listed(values: dict[str, object]) -> str:
     return "{" + ",".join(f"{k}:{list(v) if isinstance(v, tuple) else v}" for k, v in values.items()) + "}"
 
 
-def measurements(name: str, data_seed: int, most: int, out: Path) -> Path:
+def measurements(name: str, system: System, data_seed: int, most: int, out: Path) -> Path:
     """Simulate the data of a system and seed, once."""
-    system, where = SYSTEMS[name], out / "data" / f"{name}_{data_seed}"
+    where = out / "data" / f"{name}_{data_seed}"
     path = where / "measurements.parquet"
     if not path.exists():
         rows = TESTS + most
@@ -95,21 +107,31 @@ def measurements(name: str, data_seed: int, most: int, out: Path) -> Path:
 
 
 def fits(
-    systems: list[str], methods: list[str], data_seeds: int, model_seeds: int, small: bool, share: float, out: Path
+    setting: str,
+    systems: list[str],
+    methods: list[str],
+    data_seeds: int,
+    model_seeds: int,
+    small: bool,
+    share: float,
+    out: Path,
 ) -> list[Fit]:
     """Return every fit of the panel; neighbours share the compiled program."""
     every = []
     for name in systems:
-        system = SYSTEMS[name]
+        system = SETTINGS[setting][name]
+        sim = name if setting == "informative" else f"{name}_published"
         for method in methods:
             steps = max(1, round((5000 if small else system.steps) * share))
             more = WIDE.get(method, ()) if system.wide else ()
             key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
             for n in system.small if small else system.sizes:
                 for data_seed in range(data_seeds):
-                    path = measurements(name, data_seed, max(system.small if small else system.sizes), out).resolve()
+                    path = measurements(
+                        name, system, data_seed, max(system.small if small else system.sizes), out
+                    ).resolve()
                     words = [
-                        f"sim={name}", "data=panel", f"data.path={path}", f"data.noise_std={listed(dict(system.noise))}",
+                        f"sim={sim}", "data=panel", f"data.path={path}", f"data.noise_std={listed(dict(system.noise))}",
                         f"data.n_train={n}", f"data.seed={data_seed}", f"method={method}", f"run.name={name}",
                         f"run.seeds={model_seeds}",
                     ]  # fmt: skip
@@ -166,6 +188,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="tests.reproduce.panel_a", description=__doc__)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--size", choices=("small", "full"), default="small")
+    parser.add_argument("--setting", choices=list(SETTINGS), default="informative")
     parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--data-seeds", type=int)
@@ -174,9 +197,10 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     small = options.size == "small"
-    out = folder(options.out, f"panel_a_{options.size}")
+    out = folder(options.out, f"panel_a_{options.setting}_{options.size}")
     every = fits(
-        options.systems, options.methods, options.data_seeds or (2 if small else 5), options.model_seeds or (1 if small else 5),
+        options.setting, options.systems, options.methods,
+        options.data_seeds or (2 if small else 5), options.model_seeds or (1 if small else 5),
         small, options.steps or (0.3 if small else 1.0), out,
     )  # fmt: skip
     run(every, out, options.processes)
