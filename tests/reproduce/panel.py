@@ -6,6 +6,7 @@ A fit is what `simpel fit` does with the words of the job; its directory keeps t
 import itertools
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -95,8 +96,16 @@ def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
 
 
 def _pin(cores: "multiprocessing.Queue[int]") -> None:
-    """Keep a worker on one core, before JAX counts them."""
+    """Keep a worker on one core, before JAX counts them, and end it with the script, however that ends."""
     os.sched_setaffinity(0, {cores.get()})
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _done(directory: Path) -> bool:
