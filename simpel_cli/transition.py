@@ -68,11 +68,11 @@ def transition(model: Model, encoding: Encoding) -> Transition:
     n_inputs = len(model.inputs)
     rows = [[q.name for q in model.outputs].index(q.name) for q in encoding.outputs]
 
-    needed = -(-model.memory() // model.dt)
+    needed = model.past()
     if needed > encoding.stack:
         raise ConfigError(
             f"data.stack_actions: {encoding.stack}, but inputs of {model.name} act up to {model.memory():.3g} s later: a "
-            f"transition needs the {needed:.0f} inputs before its own. Use data.stack_actions={needed:.0f}."
+            f"transition needs the {needed} inputs before its own. Use data.stack_actions={needed}."
         )
     params = [q.name for q in model.params]
 

@@ -6,7 +6,19 @@ from typing import Any, Protocol
 
 from simulators.expression import Symbol
 from simulators.model import Model, ModelError, column
-from simulators.quantity import TIMES, Quantity, read_number, read_term, read_times, read_uncertain, refuse_unknown
+from simulators.quantity import (
+    TIMES,
+    Quantity,
+    check_free,
+    check_keys,
+    check_model_name,
+    check_spelling,
+    read_number,
+    read_term,
+    read_times,
+    read_uncertain,
+    refuse_unknown,
+)
 
 
 class Base(Protocol):
@@ -20,7 +32,8 @@ class Base(Protocol):
 class Extended:
     """A simulator with further parameters and terms.
 
-    A transition is then integrated in the states, also where the simulator alone has coordinates of its own.
+    A transition is then integrated in the states, also where the simulator alone has coordinates of its own (whose limits are
+    lost with them).
 
     Args:
         name: letters, digits and single underscores.
@@ -43,16 +56,20 @@ class Extended:
 
     def model(self) -> Model:
         """Check everything and build the model."""
+        check_model_name(self.name)
         base = self.base.model()
         if not isinstance(base, Model):
             raise ModelError(
                 "sim.base: a world shows no equations that terms could be added to; give a simulator in symbols"
             )
         taken = {q.name for q in (*base.states, *base.inputs, *base.params, *base.outputs)} | base.fixed.keys()
+        taken |= {f"rate_{q.name}" for q in base.states}
         own: list[Quantity] = []
         fixed: dict[str, float] = {}
         for name, node in self.parameters.items():
             path = f"sim.parameters.{name}"
+            check_spelling("sim.parameters", name)
+            check_free(path, name)
             if name in taken:
                 raise ModelError(f"{path}: the name is taken by sim.base; choose another name")
             if isinstance(node, Mapping):
@@ -61,6 +78,8 @@ class Extended:
                 fixed[name] = read_number(path, node)
         _known("inputs", self.inputs, base.inputs)
         _known("dynamics", self.dynamics, base.states)
+        for name, node in self.inputs.items():
+            check_keys(f"sim.inputs.{name}", node, ("value", *TIMES))
         params = (*base.params, *own)
         values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
 

@@ -5,7 +5,6 @@
 `Declared` is its YAML form, a few expressions; a system too large for those builds `Model` in Python.
 """
 
-import keyword
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,14 +13,17 @@ from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, symbols_used
+from simulators.expression import ExpressionError, Symbol, symbols_used
 from simulators.quantity import (
     LIMITS,
     TIMES,
     ModelError,
     Quantity,
+    check_free,
     check_keys,
     check_mapping,
+    check_model_name,
+    check_spelling,
     read_expression,
     read_limits,
     read_number,
@@ -37,6 +39,7 @@ from simulators.quantity import (
 __all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
 
 UNLIMITED = (-math.inf, math.inf)
+TIE = 1e-9  # rows; a delay of a whole number of rows must not need one more
 
 
 class Coordinates(NamedTuple):
@@ -128,6 +131,10 @@ class Model:
         ends = [[high[v] if isinstance(v, str) else v for v in times.values()] for times in (self.delay, self.lag)]
         return max(ends[0], default=0.0) + 3 * max(ends[1], default=0.0)
 
+    def past(self) -> int:
+        """Return the number of inputs before its own that a transition depends on."""
+        return math.ceil(self.memory() / self.dt - TIE)
+
     def function(self) -> casadi.Function:
         """Return the CasADi function (x, u, p) -> (dx, y); every argument is a column, empty ones are 0 x 1.
 
@@ -210,11 +217,7 @@ class Declared:
             ModelError: names the key, what it holds, what is allowed and the cure.
 
         """
-        if not (isinstance(self.name, str) and casadi.Function.check_name(self.name)):
-            raise ModelError(
-                f"sim.name: {self.name!r} is no model name; allowed: letters, digits and single underscores, "
-                "beginning with a letter, no word that CasADi reserves"
-            )
+        check_model_name(self.name)
         dt = read_number("sim.dt", self.dt)
         if dt <= 0:
             raise ModelError(f"sim.dt: {dt:g} s is not positive; give the duration of one transition in seconds")
@@ -263,6 +266,11 @@ class Declared:
             coordinates=self.own_coordinates(known),
             symbol=self.symbol,
         )
+        if model.coordinates is not None and model.limits:
+            raise ModelError(
+                f"sim.states.{next(iter(model.limits))}.limits: {type(self).__name__} is not integrated in its states, so that "
+                "nothing could be put back; leave limits out"
+            )
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
 
@@ -285,16 +293,10 @@ class Declared:
                         f"{path}: a name became {name}: YAML reads no, off, false, yes, on and true as booleans; "
                         'quote it ("no": ...) or choose another name'
                     )
-                if not isinstance(name, str) or not name.isidentifier() or "__" in name or keyword.iskeyword(name):
-                    raise ModelError(
-                        f"{path}: {name!r} is no name; allowed: letters, digits and single underscores, not beginning "
-                        "with a digit, no word of Python's such as lambda or in"
-                    )
+                check_spelling(path, name)
                 if section in ("dynamics", "gap"):  # these refer to quantities, the others introduce them
                     continue
-                if name in RESERVED:
-                    what = "constant" if name in CONSTANTS else "function"
-                    raise ModelError(f"{path}.{name}: {name} is a {what} of expressions; choose another name")
+                check_free(f"{path}.{name}", name)
                 if name in taken:
                     raise ModelError(f"{path}.{name}: the name is taken by {taken[name]}; choose another name")
                 taken[name] = f"{path}.{name}"

@@ -1,10 +1,13 @@
 """One named number of a simulator with its unit, range and prior, and how YAML declares it."""
 
+import keyword
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, NoReturn
 
-from simulators.expression import ExpressionError, Symbol, did_you_mean, parse
+import casadi
+
+from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, did_you_mean, parse
 
 PRIORS = ("uniform", "normal", "lognormal")
 TIMES = ("delay", "lag")  # of an input
@@ -29,6 +32,31 @@ class Quantity(NamedTuple):
     high: float
     periodic: bool = False
     prior: str = "uniform"
+
+
+def check_model_name(name: Any) -> None:
+    """Refuse what CasADi cannot call a function."""
+    if not (isinstance(name, str) and casadi.Function.check_name(name)):
+        raise ModelError(
+            f"sim.name: {name!r} is no model name; allowed: letters, digits and single underscores, "
+            "beginning with a letter, no word that CasADi reserves"
+        )
+
+
+def check_spelling(path: str, name: Any) -> None:
+    """Refuse what cannot be a name in an expression."""
+    if not isinstance(name, str) or not name.isidentifier() or "__" in name or keyword.iskeyword(name):
+        raise ModelError(
+            f"{path}: {name!r} is no name; allowed: letters, digits and single underscores, not beginning "
+            "with a digit, no word of Python's such as lambda or in"
+        )
+
+
+def check_free(path: str, name: str) -> None:
+    """Refuse the name of a constant or function of expressions."""
+    if name in RESERVED:
+        what = "constant" if name in CONSTANTS else "function"
+        raise ModelError(f"{path}: {name} is a {what} of expressions; choose another name")
 
 
 def check_mapping(path: str, node: Any) -> None:

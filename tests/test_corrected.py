@@ -53,6 +53,9 @@ def test_the_yaml_has_the_rates_that_were_fitted(sim: str, monkeypatch: pytest.M
     together = augment(model, terms, [q.name for q in model.states])
     random, knobs = np.random.default_rng(0), [k.starts[0] for t in terms for k in t.knobs]
     assert left_out == []
+    for term in terms:
+        if term.kind == "delay":
+            assert new.fixed[new.delay[term.acts_on]] == term.knobs[0].starts[0]
     changed = 0.0
     for _ in range(10):
         x, u, p = (

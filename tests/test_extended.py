@@ -12,7 +12,7 @@ from simulators.model import Model, ModelError
 
 
 def extended(base: str, **parts: Any) -> Model:
-    node = {"_target_": "simulators.extended.Extended", "name": "more", "base": whole_node(base), **parts}
+    node = {"_target_": "simulators.extended.Extended", "name": "more", "base": whole_node(base)} | parts
     made = build(node, "sim").model()
     assert isinstance(made, Model)
     return made
@@ -64,6 +64,11 @@ def test_commands_become_late_and_the_car_keeps_its_coordinates() -> None:
         ),
         ({"inputs": {"stear": {"value": "1"}}}, r"sim\.inputs\.stear: sim\.base has no such name"),
         ({"parameters": {"m": 1.0}}, r"sim\.parameters\.m: the name is taken by sim\.base"),
+        ({"parameters": {"rate_omega": 1.0}}, r"sim\.parameters\.rate_omega: the name is taken by sim\.base"),
+        ({"parameters": {"sin": 1.0}}, r"sim\.parameters\.sin: sin is a function of expressions"),
+        ({"inputs": {"steer": {"dely": 0.1}}}, r"sim\.inputs\.steer\.dely: unknown key; allowed: value, delay, lag"),
+        ({"inputs": {"steer": "0.5*steer"}}, r"sim\.inputs\.steer: '0\.5\*steer' is not a mapping"),
+        ({"name": "no name"}, r"sim\.name: 'no name' is no model name"),
         ({"dynamics": {"omega": "-q*omega"}}, r"sim\.dynamics\.omega: unknown name 'q'"),
         (
             {"inputs": {"steer": {"delay": "q"}}},

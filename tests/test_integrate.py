@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.integrate import rk4
+from simpel_cli.integrate import rk4, rk4_step
 
 START, DURATION = np.array([0.3, 0.4]), 1.5
 
@@ -48,3 +48,15 @@ def test_one_step_is_the_taylor_polynomial() -> None:
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_dtype_is_kept(dtype: jnp.dtype) -> None:
     assert rk4(limit_cycle, jnp.array(START, dtype), DURATION, 2).dtype == dtype
+
+
+def test_stages_in_a_loop_are_the_same_step() -> None:
+    """Values and derivatives, which is what the loop is for."""
+    start = jnp.array(START)
+
+    def step(x: jax.Array, scanned: bool) -> jax.Array:
+        return rk4_step(limit_cycle, x, 0.3, scanned=scanned)
+
+    np.testing.assert_allclose(step(start, True), step(start, False), rtol=1e-14)
+    for slope in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(slope(step)(start, True), slope(step)(start, False), rtol=1e-13)

@@ -4,7 +4,9 @@ import casadi
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import whole_node
 
+from simpel_cli.nodes import build
 from simpel_cli.transition import encoding_of, transition
 from simulators.model import Coordinates, Declared, Model, ModelError, Quantity
 from simulators.worlds.rk4 import RK4
@@ -76,3 +78,10 @@ def test_a_model_is_integrated_in_its_own_coordinates() -> None:
         np.testing.assert_allclose(one, [1.5 * np.exp(-2)], rtol=1e-12)
     for one in step(logarithmic((-1.0, 3.0)), [1.5]):
         np.testing.assert_allclose(one, [np.exp(-1)], rtol=1e-12)
+
+
+def test_states_that_are_not_integrated_have_no_limits() -> None:
+    node = whole_node("racecar")
+    node["states"]["vx"]["limits"] = [-1, 1]
+    with pytest.raises(ModelError, match=r"sim\.states\.vx\.limits: RaceCar is not integrated in its states"):
+        build(node, "sim").model()

@@ -115,6 +115,48 @@ def test_sysid_finds_the_better_of_two_valleys_from_several_starts() -> None:
     assert float(many.noise_std[0]) < 0.06
 
 
+def test_sysid_follows_a_curved_valley_to_its_end() -> None:
+    """f = a x + (b - 3 a^2): steps are refused again and again on the way, which is no sign of the end."""
+
+    def curved(x: jax.Array, phi: jax.Array) -> jax.Array:
+        return phi[:1] * x * 0.1 + (phi[1:] - 3 * phi[:1] ** 2)
+
+    params = (Quantity("a", "", -1.0, 1.0), Quantity("b", "", -6.0, 6.0))
+    y = np.asarray(0.8 * X * 0.1 + (2.5 - 3 * 0.8**2))
+    prior = prior_of(params=params)._replace(step=curved)
+    rule = SysID(starts=1, noise=FIXED).bind(setting_of(prior), problem_of(y))
+    for seed in range(3):
+        end = run(rule, 200, seed)
+        phi = np.asarray([-1.0, -6.0]) + np.asarray([2.0, 12.0]) * np.asarray(end.u[0])
+        np.testing.assert_allclose(phi, [0.8, 2.5], atol=2e-3)
+
+
+def test_sysid_rests_where_every_start_has_ended() -> None:
+    """An ended search is left as it is, whatever the number of steps, one problem at a time or several."""
+    problems = [problem_of(slope * X) for slope in (0.5, -1.2)]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+    setting = setting_of(prior_of())
+
+    def ended(problem: Problem, steps: int) -> Any:
+        return run(SysID(noise=FIXED).bind(setting, problem), steps).u
+
+    together = jax.vmap(lambda problem: ended(problem, 60))(both)
+    for one, mine in zip(problems, together, strict=True):
+        np.testing.assert_array_equal(ended(one, 60), ended(one, 90))
+        np.testing.assert_allclose(mine, ended(one, 60), atol=1e-6)
+
+
+def test_a_wide_simulator_a_few_draws_at_a_time_is_the_same_simulator() -> None:
+    """Draws, and the search for parameters, whatever the number of transitions that fit the cache."""
+    prior = prior_of()
+    key, x = jax.random.key(3), jnp.asarray(X)
+    wide = prior._replace(width=5000)
+    np.testing.assert_allclose(wide.simulate(key, x, 37), prior.simulate(key, x, 37), rtol=1e-12)
+    y = 1.3 * X - 0.4
+    one, other = (run(SysID(noise=FIXED).bind(setting_of(p), problem_of(y)), 40).u for p in (prior, wide))
+    np.testing.assert_allclose(one, other, atol=1e-6)
+
+
 def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     y = 1.3 * X - 0.4 + 0.5 * np.sin(3 * X) + NOISE * RANDOM.normal(size=X.shape)
     method = ExactGP(sysid=SysID(noise=FIXED), particles=50)

@@ -394,3 +394,37 @@ def test_driver_changes_its_mind_and_stays_within_the_range() -> None:
         OrnsteinUhlenbeck(means={"u": 2.0})
     with pytest.raises(ModelError, match=r"excitation\.pull: 0 is not positive"):
         OrnsteinUhlenbeck(pull=0)
+
+
+def test_a_delay_beyond_its_range_holds_the_first_input() -> None:
+    """A truth that the prior did not foresee: 0.5 s where at most 0.2 s were declared; nothing wraps to newer inputs."""
+    late = Declared(
+        "late", dt=0.1, substeps=1, states={"v": {"unit": "m/s", "range": [0, 0.1]}},
+        inputs={"u": {"unit": "V", "range": [-1, 1], "delay": "d"}},
+        parameters={"d": {"unit": "s", "range": [0.1, 0.2]}}, dynamics={"v": "u"},
+    ).model()  # fmt: skip
+    made = Simulate(episodes=2, steps=30, initial={"v": [0, 0]}, truth={"d": 0.5}).run(late).columns
+    u, v = made["u"].reshape(2, 30), made["v"].reshape(2, 30)
+    before = np.concatenate([np.repeat(u[:, :1], 5, axis=1), u], axis=1)
+    np.testing.assert_allclose(v[:, 1:], np.cumsum(0.1 * before[:, :29], axis=1), atol=1e-12)
+    # asked for single transitions with too short a past: the oldest input was held, a negative delay is none
+    query = RK4(late).follow(np.zeros((2, 1)), np.array([[[1.0], [2.0]]] * 2), np.array([[0.5], [-0.3]]))
+    np.testing.assert_allclose(query[:, 0], [0.1, 0.2])
+
+
+def test_columns_that_would_be_called_alike() -> None:
+    twice = Declared(
+        "twice", dt=0.1, states={name: {"unit": "m", "range": [0, 1]} for name in ("x", "next_x")},
+        dynamics={"x": "1", "next_x": "2"},
+    ).model()  # fmt: skip
+    with pytest.raises(
+        ModelError, match=r"simulation\.layout: twice calls a quantity `next_x`, as the column of a next state"
+    ):
+        Simulate(episodes=1, steps=5, layout="transitions").run(twice)
+    made = Simulate(episodes=2, steps=5).run(twice)
+    assert made.card["columns"]["next_x"] == {"unit": "m"}
+    counted = Declared(
+        "counted", dt=0.1, states={"episode": {"unit": "1", "range": [0, 1]}}, dynamics={"episode": "1"}
+    ).model()
+    split = Simulate(episodes=1, steps=8, layout="transitions").run(counted).columns["split"]
+    assert (split == "test").sum() == 2

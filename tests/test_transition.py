@@ -110,7 +110,7 @@ def test_simulators_agree_with_casadi(sim: str) -> None:
 def test_simulators_step_in_batches(sim: str) -> None:
     """Every symbolic simulator gives finite targets over its domain, and keeps angles on the unit circle."""
     m = model(sim)
-    encoding = encoding_of(m, tuple(q.name for q in m.outputs))
+    encoding = encoding_of(m, tuple(q.name for q in m.outputs), m.past())
     bound = transition(m, encoding)
     x = Domain(encoding).sample(jax.random.key(0), 16, jnp.float64)
     phi = jnp.asarray(draw(m.params, np.random.default_rng(0), 16))

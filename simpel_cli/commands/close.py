@@ -22,8 +22,8 @@ Summary = dict[str, dict[str, dict[str, list[float]]]]
 
 def memory_of(sim: dict[str, Any]) -> int:
     """Return the number of past inputs that a transition of a declared simulator needs."""
-    model = build(sim, "sim").model()
-    return int(-(-model.memory() // model.dt))
+    past: int = build(sim, "sim").model().past()
+    return past
 
 
 def close(

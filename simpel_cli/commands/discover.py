@@ -134,7 +134,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
-    if found["effects"] and isinstance(config["sim"].get("dynamics"), dict):
+    if found["effects"]:
         name, node, left_out = corrected(config["sim"], model, search, selection.chosen)
         path = directory / "conf" / "sim" / f"{name}.yaml"
         path.parent.mkdir(parents=True)

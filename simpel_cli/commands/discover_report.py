@@ -102,15 +102,16 @@ def _cells(row: Mapping[str, Any], name: str, sign: str = "") -> list[str]:
 
 def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any] | None) -> Section:
     """Right-hand sides before and after, with what is new marked."""
-    old = before.get("dynamics")
-    if not isinstance(old, Mapping):
+    old, new = _rates(before), _rates(after) if after is not None else {}
+    for state in new:
+        old.setdefault(state, f"[as in {before.get('name')}]")
+    if not (old or _timing(after or {})):
         return {}
     timing = _timing(before)
     lines = [[(text, False)] for text in [*(f"d({s})/dt = {e}" for s, e in old.items()), *timing]]
     blocks = [{"title": "before" if found["effects"] else "as declared", "lines": lines}]
     text = ""
     if after is not None and found["effects"]:
-        new = after["dynamics"]
         lines = [[(f"d({s})/dt = ", False), *marked(str(old.get(s, "")), str(e))] for s, e in new.items()]
         lines += [[(line, line not in timing)] for line in _timing(after)]
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
@@ -119,6 +120,17 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
             text = f"The corrected YAML lacks {'; '.join(words(name) for name in lacks)}. The errors above are with it."
     title = "The equation before and after" if found["effects"] else "The equation"
     return {"title": title, "equations": blocks, "after": text}
+
+
+def _rates(sim: Mapping[str, Any]) -> dict[str, str]:
+    """Return the right-hand sides that a `sim:` node tells; of equations in Python what was added to them."""
+    rates = {s: str(e) for s, e in (sim.get("dynamics") or {}).items()}
+    if not isinstance(base := sim.get("base"), Mapping):
+        return rates
+    own = _rates(base)
+    inputs = [f"{name} for {node['value']}" for name, node in (sim.get("inputs") or {}).items() if "value" in node]
+    words = f"[as in {base.get('name')}{', with ' + ', '.join(inputs) if inputs else ''}]"
+    return own | {s: f"{own.get(s, words)} + {e}" for s, e in rates.items()}
 
 
 def _timing(sim: Mapping[str, Any]) -> list[str]:

@@ -140,7 +140,9 @@ def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], 
         named = [t for e in effects for t in e.attach(model, scales, measured)]
     except ModelError as error:
         raise ConfigError(str(error)) from error
-    return named + unnamed(model, scales, pairs=pairs)
+    # what is late already is calibrated: a second delay of the same input could not be told from the first
+    late = {DELAY: model.delay, LAG: model.lag}
+    return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
 
 
 def key_of(term: Term) -> Key:

@@ -24,6 +24,7 @@ from simpel_cli.prior import WIDE, FunctionPrior
 from simpel_cli.transition import OneStep
 
 FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
+HOPELESS = 1e6  # damping at which a refused step was as good as none
 EASIER, HARDER = 0.3, 5.0  # what the damping is multiplied by
 SMALL, PATIENCE = 1e-6, 4  # a start has ended where its loss falls by less than so much of itself, so many times on end
 FAR = 6.0  # standard deviations of a normal prior that a parameter may go
@@ -132,7 +133,9 @@ class SysID:
             here = jnp.where(good, new, at)
             damping = jnp.clip(state.damping * jnp.where(good, EASIER, HARDER), 1e-9, MOST_DAMPING)
             gained = jnp.where(good, state.loss - value, 0.0) > SMALL * (1 + jnp.abs(state.loss))
-            idle = jnp.where(gained, 0.0, state.idle + 1).astype(dtype)
+            # a step that was refused says nothing before it was tried shorter and shorter
+            waited = (good | (state.damping >= HOPELESS)).astype(dtype)
+            idle = jnp.where(gained, 0.0, state.idle + waited).astype(dtype)
             return State(here[:dim_u], here[dim_u:], damping.astype(dtype), jnp.where(good, value, state.loss), idle)
 
         def all_better(state: State) -> State:

@@ -6,9 +6,7 @@ from functools import cached_property
 import casadi
 import numpy as np
 
-from simulators.model import Flow, Model, ModelError
-
-TIE = 1e-9  # rows; a delay of a whole number of rows must not become a sliver of another input
+from simulators.model import TIE, Flow, Model, ModelError
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +31,9 @@ class RK4:
                 "make it a state of its own"
             )
 
-    @property
-    def past(self) -> int:
-        """Number of inputs before its own that a transition depends on."""
-        return int(np.ceil(self.model.memory() / self.model.dt - TIE))
+    def past(self, params: np.ndarray) -> int:
+        """Return the number of inputs before its own that a transition of any of the queries (n, dp) depends on."""
+        return int(np.ceil(np.max(self._delays(params), initial=0.0) / self.model.dt - TIE))
 
     def step(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
         """Integrate n queries over dt: states (n, dx), inputs (n, du), params (n, dp) -> (n, dx), not wrapped.
@@ -57,7 +54,8 @@ class RK4:
 
         Args:
             states: (n, dx).
-            history: (n, past + 1, du) inputs, oldest first, each held for dt; the last one is given now.
+            history: (n, past + 1, du) inputs, oldest first, each held for dt; the last one is given now. Before it the
+                oldest was held.
             params: (n, dp).
 
         Returns:
@@ -78,7 +76,7 @@ class RK4:
             begin, length = edges[:, k], edges[:, k + 1] - edges[:, k]
             if not length.any():
                 continue
-            back = (whole + (begin[:, None] < part)).astype(int)
+            back = np.minimum(whole + (begin[:, None] < part), newest).astype(int)
             u = np.take_along_axis(history, newest - back[:, None, :], axis=1)[:, 0]
             z = self._hold(z, u, p, length * self.model.dt)
         return z if self._flow.leave is None else _evaluate(self._flow.leave, z, p)
@@ -103,7 +101,7 @@ class RK4:
             value = self.model.delay.get(q.name, 0.0)
             own = self.model.fixed.get(value, value) if isinstance(value, str) else value
             late[:, i] = params[:, names.index(own)] if isinstance(own, str) else own
-        return late
+        return np.maximum(late, 0.0)  # a normal prior has draws beyond its range
 
     def _hold(self, z: np.ndarray, u: np.ndarray, p: np.ndarray, duration: np.ndarray) -> np.ndarray:
         """Integrate (n, dz) with constant inputs (n, du), each query for its own duration (n,), s."""

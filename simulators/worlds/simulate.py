@@ -24,6 +24,7 @@ from simulators.worlds.world import World
 OWN_COLUMNS = ("episode", "t", "split")
 LAYOUTS = ("trajectories", "transitions")
 NOISE_ON = ("both", "next")
+NEXT = ("next_", "exact_next_")  # of the columns of layout transitions
 LICENCE = "made by simpel simulate: simulated data, not measured on a real system"
 
 
@@ -110,6 +111,14 @@ class Simulate:
                     f"simulation: {source.name} calls a quantity `{quantity.name}`, as a column of its own is called "
                     f"({', '.join(own)}); choose another name, or simulation.layout=transitions, which has no time"
                 )
+        if source.states and self.layout == "transitions":
+            made = {f"{part}{q.name}" for q in source.states for part in NEXT}
+            for quantity in (*source.states, *source.inputs, *source.outputs):
+                if quantity.name in made:
+                    raise ModelError(
+                        f"simulation.layout: {source.name} calls a quantity `{quantity.name}`, as the column of a next state "
+                        "is called; choose another name"
+                    )
         measurable = (*source.states, *source.outputs)
         _known("noise_std", self.noise_std, measurable)
         _known("unmeasured", self.unmeasured, measurable)
@@ -124,11 +133,13 @@ class Simulate:
             columns = self._transitions(source, truth)
         else:
             columns = self._trajectories(source, truth)
-        left_out = {f"{part}{name}" for name in self.unmeasured for part in ("", "next_", "exact_next_")}
+        left_out = {f"{part}{name}" for name in self.unmeasured for part in ("", *NEXT)}
         columns = {name: values for name, values in columns.items() if name not in left_out}
         if self.test_fraction:
             rows = np.arange(self.episodes * self.steps)
-            columns["split"] = self._split(columns.get("episode", rows))
+            columns["split"] = self._split(
+                columns["episode"] if source.states and self.layout == "trajectories" else rows
+            )
         return Simulation(columns, self._card(source, truth, columns))
 
     def _stream(self, name: str, episode: int = 0) -> np.random.Generator:
@@ -150,7 +161,7 @@ class Simulate:
         states = np.zeros((n, steps, len(source.states)))
         states[:, 0] = self._initial(source)
         model = RK4(source) if isinstance(source, Model) else None
-        past = model.past if model is not None else 0
+        past = model.past(params) if model is not None else 0
         given = np.concatenate(
             [np.repeat(inputs[:, :1], past, axis=1), inputs], axis=1
         )  # the first one was held before
@@ -275,7 +286,7 @@ class Simulate:
             "dt": source.dt,
             "episodes": self.episodes,
             "steps": self.steps,
-            "columns": {name: {"unit": units[bare]} for name in columns if (bare := _bare(name)) in units},
+            "columns": {name: {"unit": units[bare]} for name in columns if (bare := _bare(name, units)) in units},
             "noise_std": {q.name: float(self.noise_std.get(q.name, 0)) for q in measured},
         }
         if source.states and self.layout == "transitions":
@@ -289,9 +300,9 @@ class Simulate:
         return card
 
 
-def _bare(column: str) -> str:
+def _bare(column: str, known: Iterable[str]) -> str:
     """Return the quantity that a column is about."""
-    return column.removeprefix("exact_").removeprefix("next_")
+    return column if column in known else column.removeprefix("exact_").removeprefix("next_")
 
 
 def _known(key: str, given: Iterable[str], quantities: tuple[Quantity, ...]) -> None:

@@ -35,8 +35,7 @@ def measured(name: str) -> dict[str, float]:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     model = build(yaml.safe_load((SIMS / f"{name}.yaml").read_text()), "sim").model()
     began = time.perf_counter()
-    stack = int(np.ceil(model.memory() / model.dt - 1e-9))
-    system = system_of(model, tuple(q.name for q in model.outputs), stack)
+    system = system_of(model, tuple(q.name for q in model.outputs), model.past())
     ready = time.perf_counter() - began
     prior = SimulatorPrior(gap=None).bind(system.transition, *system.dims, np.ones(system.encoding.dim_x))
     x = system.domain.sample(jax.random.key(0), POINTS, jnp.float32)

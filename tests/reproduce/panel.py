@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
@@ -19,11 +19,12 @@ import scipy.stats
 from simpel_cli.config import launch
 from simpel_cli.errors import SimpelError
 from simpel_cli.plots.canvas import legend_below, line_style, new_figure, ratio_scale, save
-from simpel_cli.records import read_metrics, write_table
+from simpel_cli.records import read_metrics, write_table, write_text
 from simpel_cli.run import read_manifest
 
 CONF = Path(__file__).parent / "conf"
-METRICS = ("nll", "nrmse", "crps", "coverage", "calibration_error")
+METRICS = ("nll", "nrmse")
+WORDS = "words.txt"  # of a fit: another fit of the same name is not this one
 
 
 class Fit(NamedTuple):
@@ -62,14 +63,9 @@ class Cell(NamedTuple):
     def spread(self) -> float:
         """Standard deviation over model seeds of the mean over data seeds, as the paper's bands have it; of one model
         seed that over data seeds."""
-        means = np.nanmean(self.values, axis=0 if self.values.shape[1] > 1 else 1)
-        return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
-
-    @property
-    def range(self) -> tuple[float, float, float]:
-        """10 %, 50 % and 90 % of all fits."""
-        low, middle, high = np.nanpercentile(self.values, [10, 50, 90])
-        return float(low), float(middle), float(high)
+        values = self.values[np.isfinite(self.values).any(axis=1)]
+        means = np.nanmean(values, axis=0 if values.shape[1] > 1 else 1)
+        return float(np.nanstd(means, ddof=1)) if len(means) > 1 else 0.0
 
 
 Table = dict[tuple[str, str, int], Cell]  # (system, method, n_train)
@@ -77,7 +73,7 @@ Table = dict[tuple[str, str, int], Cell]  # (system, method, n_train)
 
 def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
     """Run what is missing, longest sizes first, and say how it goes; a fit that fails costs itself only."""
-    todo = [fit for fit in fits if not _done(out / fit.name)]
+    todo = [fit for fit in fits if not _done(fit, out)]
     print(f"{len(fits)} fits, {len(fits) - len(todo)} are there, {len(todo)} to run", flush=True)
     began = time.perf_counter()
     context = multiprocessing.get_context("spawn")
@@ -108,10 +104,12 @@ def _pin(cores: "multiprocessing.Queue[int]") -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _done(directory: Path) -> bool:
+def _done(fit: Fit, out: Path) -> bool:
+    """Say whether a fit of these very words is there."""
+    words = out / fit.name / WORDS
     try:
-        return bool(read_manifest(directory)["status"] == "done")
-    except SimpelError:
+        return read_manifest(out / fit.name)["status"] == "done" and words.read_text().splitlines() == [*fit.words]
+    except (SimpelError, OSError):
         return False
 
 
@@ -131,39 +129,55 @@ def _fit(fit: Fit, directory: Path) -> str:
     words = [*fit.words, f"hydra.run.dir={directory}", "run.figures=false", "run.quiet=true"]
     try:
         launch("fit", task, words, config_dir=CONF, flags=[])
-    except SimpelError as error:
-        return f"failed: {error}"
-    nll = [r["value"] for r in joint(directory) if r["metric"] == "nll"]
+    except Exception as error:  # whatever it is, it costs this fit and no other
+        return f"failed: {error!r}"
+    write_text(directory / WORDS, "\n".join(fit.words) + "\n")
+    nll = [r["value"] for r in tested(directory) if (r["metric"], r["output"]) == ("nll", "joint")]
     return f"NLL {np.mean(nll):.3g}  {time.perf_counter() - began:.0f} s"
 
 
-def joint(directory: Path) -> list[dict[str, object]]:
-    """Return the joint test metrics of a fit, a row for each model seed."""
-    rows = read_metrics(directory / "metrics.parquet")
-    return [r for r in rows if r["split"] == "test" and r["output"] == "joint" and r["metric"] in METRICS]
+def tested(directory: Path) -> list[dict[str, Any]]:
+    """Return the test metrics of a fit."""
+    return [r for r in read_metrics(directory / "metrics.parquet") if r["split"] == "test"]
+
+
+def scales(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Return what normalises the error of every output: the spread over the ranges of the simulator that a fit had."""
+    rmse, normalised = ({r["output"]: r["value"] for r in rows if r["metric"] == m} for m in ("rmse", "nrmse"))
+    return {name: rmse[name] / normalised[name] for name in normalised if name != "joint" and normalised[name] > 0}
+
+
+def judged(rows: list[dict[str, Any]], scale: dict[str, float]) -> list[tuple[int, str, float]]:
+    """Return (model seed, metric, value): joint NLL, and the root mean square of the errors of all outputs over `scale`."""
+    found = [(r["seed"], "nll", r["value"]) for r in rows if (r["metric"], r["output"]) == ("nll", "joint")]
+    for seed in sorted({r["seed"] for r in rows}):
+        own = {r["output"]: r["value"] for r in rows if r["metric"] == "rmse" and r["seed"] == seed}
+        found.append((seed, "nrmse", float(np.sqrt(np.mean([(own[name] / s) ** 2 for name, s in scale.items()])))))
+    return found
 
 
 def collect(fits: Iterable[Fit], out: Path, name: str) -> dict[str, Table]:
-    """Write `name`.parquet of all fits that are done, and return metric -> table."""
-    rows = []
-    for fit in fits:
-        if _done(out / fit.name):
-            rows += [
-                (fit.system, fit.method, fit.n_train, fit.data_seed, r["seed"], r["metric"], r["value"])
-                for r in joint(out / fit.name)
-            ]
+    """Write `name`.parquet of all fits that are done, and return metric -> table.
+
+    Errors of a system are normalised by the simulator of its first method, whatever simulator the others have.
+    """
+    fits = [fit for fit in fits if _done(fit, out)]
+    first = {fit.system: fit for fit in reversed(fits)}
+    scale = {system: scales(tested(out / fit.name)) for system, fit in first.items()}
+    rows = [(*fit[:4], *judged_row) for fit in fits for judged_row in judged(tested(out / fit.name), scale[fit.system])]
     columns = ("system", "method", "n_train", "data_seed", "model_seed", "metric", "value")
     write_table(out / f"{name}.parquet", {c: [row[i] for row in rows] for i, c in enumerate(columns)})
     found: dict[str, Table] = {}
     for metric in METRICS:
         own = [row for row in rows if row[5] == metric]
+        # every cell has a place for every seed, so that cells can be compared seed by seed
+        data, models = (sorted({row[i] for row in own}) for i in (3, 4))
         table: Table = {}
         for key in dict.fromkeys(row[:3] for row in own):
-            cell = [row for row in own if row[:3] == key]
-            data, models = (sorted({row[i] for row in cell}) for i in (3, 4))
             values = np.full((len(data), len(models)), np.nan)
-            for row in cell:
-                values[data.index(row[3]), models.index(row[4])] = row[6]
+            for row in own:
+                if row[:3] == key:
+                    values[data.index(row[3]), models.index(row[4])] = row[6]
             table[key] = Cell(values)
         found[metric] = table
     return found
@@ -180,13 +194,31 @@ def methods_of(table: Table, system: str) -> list[str]:
 
 
 def advantage(table: Table, system: str, one: str, other: str, n: int) -> tuple[float, float]:
-    """Return how much lower `one` is than `other`, paired, and the half width of its 95 % interval over data seeds."""
-    gap = table[system, other, n].values - table[system, one, n].values
-    means = np.nanmean(gap, axis=1)
+    """Return how much lower `one` is than `other`, paired, and the half width of its 95 % interval over data seeds.
+
+    nan where one of them is missing; seeds that only one of them has do not count.
+    """
+    cells = [table.get((system, method, n)) for method in (one, other)]
+    if cells[0] is None or cells[1] is None:
+        return float("nan"), float("nan")
+    gap = cells[1].values - cells[0].values
+    means = np.array([row[np.isfinite(row)].mean() for row in gap if np.isfinite(row).any()])
     if len(means) < 2:
-        return float(means.mean()), float("nan")
+        return float(means.mean()) if len(means) else float("nan"), float("nan")
     half = scipy.stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
     return float(means.mean()), float(half)
+
+
+def best_of(table: Table, system: str, methods: Iterable[str], n: int) -> str | None:
+    """Return the method with the lowest mean at a training size; None where none of them is there."""
+    there = [(table[system, m, n].mean, m) for m in methods if (system, m, n) in table]
+    return min(there)[1] if there else None
+
+
+def verdict(claim: str, good: bool | None, why: str) -> str:
+    """Return a claim with its verdict as a line of Markdown; None: what it is about was not run."""
+    word = {True: "holds", False: "DOES NOT HOLD", None: "not judged"}[good]
+    return f"* {word}: {claim} ({why})"
 
 
 def draw(path: Path, panels: Sequence[tuple[str, str, Table]], labels: dict[str, str], columns: int) -> None:
