@@ -3,7 +3,8 @@
     python -m tests.benchmarks.differences --out runs/differences [--only pendulum racecar] [--seeds 3]
 
 Data are trajectories of the high-fidelity simulator with parameters drawn from its prior, a draw per seed, with the noise of
-SYSTEMS.md; the search is given the low-fidelity simulator and every effect of the catalogue. What differs is known.
+SYSTEMS.md, which the search is told; it is given the low-fidelity simulator and every effect of the catalogue. What differs is
+known.
 """
 
 import argparse
@@ -11,6 +12,8 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import yaml
 
 from simpel_cli.records import write_table, write_text
 from tests.benchmarks.cost import searched
@@ -45,6 +48,12 @@ DIFFERENCES = {
         ("discovery.rows=300",), "regulation of genes by each other, quadratic Hill function", both=("sim.genes=3",)
     ),
 }
+
+
+def noise_of(name: str) -> str:
+    """Return the noise of the sensors as Hydra reads it: whoever has a rig knows it."""
+    declared = yaml.safe_load((CONF / "simulation" / f"low_high_{name}.yaml").read_text())["noise_std"]
+    return "{" + ",".join(f"{key}:{value}" for key, value in declared.items()) + "}"
 
 
 def simulated(name: str, seed: int, out: Path) -> Path:
@@ -98,7 +107,7 @@ def main() -> None:
             path = simulated(name, seed, options.out).resolve()
             found = searched(
                 [f"sim={name}", "data=low_high", "--config-dir", str(CONF), f"data.path={path}", f"run.name={name}",
-                 "close=false", *pair.search, *pair.both],
+                 f"data.noise_std={noise_of(name)}", "close=false", *pair.search, *pair.both],
                 options.out / f"{name}_{seed}",
             )  # fmt: skip
             effects = [f"{e['name']} on {e['acts_on']}" for e in found["effects"]]
