@@ -81,6 +81,20 @@ def test_experiment_runs_on_its_recording(
         assert again.code == 0, again.err
 
 
+@pytest.mark.parametrize(
+    "experiment", ["racecar", *(pytest.param(e, marks=pytest.mark.slow) for e in ("greenhouse", "sergio"))]
+)
+def test_experiment_runs_on_data_that_come_along(experiment: str, tmp_path: Path) -> None:
+    small = [w for w in TINY if not w.startswith("method.steps")]
+    words = [f"experiment={experiment}", *small, "method.steps=50", "run.figures=false", "hydra.run.dir=run"]
+    result = simpel(tmp_path, "fit", *words)
+    assert result.code == 0, result.err
+    table = pq.read_table(tmp_path / "run" / "metrics.parquet").to_pylist()
+    joint = [row["value"] for row in table if (row["metric"], row["output"], row["split"]) == ("nll", "joint", "test")]
+    assert len(joint) == 1
+    assert np.isfinite(joint).all()
+
+
 def test_recordings_that_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SIMPEL_SHARED", str(tmp_path / "nowhere"))
     result = simpel(tmp_path, "fit", "experiment=rc_car")
