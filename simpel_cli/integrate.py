@@ -9,36 +9,23 @@ from jaxtyping import Array, Float
 State = Float[Array, " ds"]
 
 
-def rk4(derivative: Callable[[State], State], x: State, dt: float, substeps: int) -> State:
-    """Integrate `dx/dt = derivative(x)` over `dt` with `substeps` classical Runge-Kutta steps.
+def rk4_step(derivative: Callable[[State], State], x: State, h: float, *, scanned: bool = False) -> State:
+    """Integrate `dx/dt = derivative(x)` over h with one classical Runge-Kutta step.
 
-    The input of the system is held over `dt` (zero-order hold), so `derivative` takes the state alone.
-    The steps run in a scan: an unrolled integrator makes XLA recompute fused expressions.
+    The input of the system is held over a step (zero-order hold), so `derivative` takes the state alone. Many steps belong
+    into a scan: an unrolled integrator makes XLA recompute fused expressions.
 
     Args:
         derivative: right-hand side, state units per second.
         x: state at the start, shape (ds,).
-        dt: length of the transition, s.
-        substeps: number of equal steps, at least 1.
-
-    Returns:
-        State after `dt`, shape (ds,); global error of order (dt/substeps)^4.
-
-    Reference: Kutta (1901).
-    """
-    h = dt / substeps
-    return jax.lax.scan(lambda x, _: (rk4_step(derivative, x, h), None), x, None, length=substeps)[0]
-
-
-def rk4_step(derivative: Callable[[State], State], x: State, h: float, *, scanned: bool = False) -> State:
-    """Make one classical Runge-Kutta step of length h, s.
-
-    Args:
-        derivative: right-hand side, state units per second.
-        x: state at the start.
         h: length of the step, s.
         scanned: put the four stages into a loop, so that a long right-hand side is compiled once: XLA fuses four copies of
             hundreds of operations for minutes where derivatives are asked for. A tenth slower.
+
+    Returns:
+        State after h, shape (ds,); n steps have a global error of order h^4.
+
+    Reference: Kutta (1901).
     """
     if scanned:
         stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], x.dtype) * h

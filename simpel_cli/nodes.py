@@ -80,6 +80,10 @@ def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:
             f"{path}._target_: {target} is not a dataclass.{did_you_mean(name, public)} "
             f"({module_name} has: {', '.join(public) or 'none'})"
         )
+    if inspect.isabstract(cls):
+        raise ConfigError(
+            f"{path}._target_: {target} is a base of others, without a law of its own; name one of them, as conf/{path}/ does."
+        )
     return cls
 
 

@@ -1,14 +1,18 @@
 """A simulator whose equations are written in Python; its YAML declares quantities, ranges and fidelity."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from simulators.expression import ExpressionError, symbols_used
+from simulators.expression import ExpressionError, Symbol, symbols_used
 from simulators.model import Declared, ModelError
 from simulators.quantity import refuse_unknown
 
+FIDELITIES = ("low", "high")
+
 
 @dataclass(frozen=True)
-class Built(Declared):
+class Built(Declared, ABC):
     """Base of simulators in Python: the fields of `Declared`, without `dynamics`.
 
     A subclass says which names its equations use (`needed`) and returns the rates (`rates`), and, if a transition is not
@@ -16,9 +20,13 @@ class Built(Declared):
     have any name.
     """
 
+    @abstractmethod
     def needed(self) -> dict[str, tuple[str, ...]]:
         """Return the names that the equations use: section (states, inputs, parameters) -> names, in any order."""
-        raise NotImplementedError
+
+    @abstractmethod
+    def rates(self, known: Mapping[str, Symbol]) -> list[Symbol]:
+        """Return d(state)/dt in the order of the states, from what every name stands for."""
 
     def _check_dynamics(self) -> None:
         kind = type(self).__name__

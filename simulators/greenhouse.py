@@ -23,9 +23,9 @@ from dataclasses import dataclass
 
 import casadi
 
-from simulators.built import Built
+from simulators.built import FIDELITIES, Built
 from simulators.expression import Symbol
-from simulators.model import ModelError
+from simulators.quantity import check_word
 
 CLIMATE = ("T_g", "T_p", "T_s", "C", "V")
 CROP = ("B", "W_F", "W_L", "D")
@@ -84,9 +84,8 @@ class Greenhouse(Built):
 
     def __post_init__(self) -> None:
         """Refuse words that are not allowed."""
-        for key, allowed in (("fidelity", ("low", "high")), ("weather", ("inputs", "states"))):
-            if getattr(self, key) not in allowed:
-                raise ModelError(f"sim.{key}: {getattr(self, key)!r} is not allowed, only {' or '.join(allowed)}")
+        check_word("sim.fidelity", self.fidelity, FIDELITIES)
+        check_word("sim.weather", self.weather, ("inputs", "states"))
 
     def needed(self) -> dict[str, tuple[str, ...]]:
         """Return the names that the equations use; both fidelities have the same states and inputs."""

@@ -59,6 +59,13 @@ def check_free(path: str, name: str) -> None:
         raise ModelError(f"{path}: {name} is a {what} of expressions; choose another name")
 
 
+def check_word(path: str, word: Any, allowed: tuple[str, ...]) -> None:
+    """Refuse a word that is not one of the allowed."""
+    if word not in allowed:
+        hint = did_you_mean(str(word), list(allowed))
+        raise ModelError(f"{path}: {word!r} is not allowed, only {' or '.join(allowed)}.{hint}")
+
+
 def check_mapping(path: str, node: Any) -> None:
     """Refuse what is not a mapping."""
     if not isinstance(node, Mapping):

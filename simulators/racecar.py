@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import casadi
 
-from simulators.built import Built
+from simulators.built import FIDELITIES, Built
 from simulators.expression import Symbol
-from simulators.model import Coordinates, ModelError
+from simulators.model import Coordinates
+from simulators.quantity import check_word
 
 STATES = ("x", "y", "theta", "vx", "vy", "omega")
 INPUTS = ("steer", "throttle")
@@ -56,9 +57,8 @@ class RaceCar(Built):
 
     def __post_init__(self) -> None:
         """Refuse words that are not allowed."""
-        for key, allowed in (("fidelity", ("low", "high")), ("blend_on", ("absolute", "signed"))):
-            if getattr(self, key) not in allowed:
-                raise ModelError(f"sim.{key}: {getattr(self, key)!r} is not allowed, only {' or '.join(allowed)}")
+        check_word("sim.fidelity", self.fidelity, FIDELITIES)
+        check_word("sim.blend_on", self.blend_on, ("absolute", "signed"))
 
     def needed(self) -> dict[str, tuple[str, ...]]:
         """Return the names that the equations use."""

@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
+from simulators.built import FIDELITIES
 from simulators.expression import Symbol
 from simulators.model import Coordinates, Model, ModelError, Quantity
-from simulators.quantity import check_keys, read_number, read_range
+from simulators.quantity import check_keys, check_word, read_number, read_range
 
 EDGE = 3.0  # of z; the ends of the scale of expression
 NARROWEST = 1e-6  # standard deviation of z
@@ -86,8 +87,7 @@ class Sergio:
 
     def __post_init__(self) -> None:
         """Refuse values that are not allowed."""
-        if self.fidelity not in ("low", "high"):
-            raise ModelError(f"sim.fidelity: {self.fidelity!r} is not allowed, only low or high")
+        check_word("sim.fidelity", self.fidelity, FIDELITIES)
         for key, least in (("genes", 1), ("cells", 2), ("substeps", 1)):
             if getattr(self, key) < least:
                 raise ModelError(f"sim.{key}: {getattr(self, key)} is not allowed; give at least {least}")

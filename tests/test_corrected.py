@@ -7,10 +7,12 @@ import pytest
 import yaml
 
 from simpel_cli.config import conf_dir
+from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery import corrected as module
 from simpel_cli.discovery.augmented import augment
 from simpel_cli.discovery.fit import Optimum
 from simpel_cli.discovery.search import Search, Trial
+from simpel_cli.discovery.setup import terms_of
 from simpel_cli.nodes import build
 from simulators.effects import Scales, Term
 
@@ -75,3 +77,21 @@ def test_what_a_transition_cannot_hold_is_left_out_with_its_reason(monkeypatch: 
     assert model.lag == {}
     assert [text.split(" (")[0] for text in left_out] == ["sensor_lag on phi", "input_backlash on u"]
     assert all(len(text.split(" (")[1]) > 30 for text in left_out)
+
+
+def test_an_input_that_is_late_already_gets_no_second_delay() -> None:
+    """The corrected simulator could hold one only, and the search would have fitted the sum."""
+    prompt, late = (build(node_of("sim", sim), "sim").model() for sim in ("racecar", "rc_car_high_fidelity"))
+    effects = [build(node_of("effect", name), "effect") for name in ("input_delay", "input_lag")]
+    rows = np.linspace(0.1, 0.9, 40)
+    states, inputs = np.tile(rows[:, None], 6), np.tile(rows[:, None], 2)
+    nothing = np.zeros((40, 0))
+    episode = Episode("0", rows, states, inputs, nothing, None)
+    recording = Recording((episode,), (), (), {}, (), (), ())
+
+    def places(model: Any) -> set[tuple[str, str]]:
+        return {(t.effect, t.acts_on) for t in terms_of(model, recording, effects) if t.kind in ("delay", "lag")}
+
+    lags = {("input_lag", "steer"), ("input_lag", "throttle")}
+    assert places(prompt) == lags | {("input_delay", "steer"), ("input_delay", "throttle")}
+    assert places(late) == lags

@@ -219,3 +219,23 @@ def test_priors_are_compared_size_by_size() -> None:
     assert "-9.07" in section["rows"][0][2]
     assert "-9.26" in section["rows"][0][3]
     assert prior_section({}) == {}
+
+
+def test_equations_in_python_show_what_was_added() -> None:
+    before = {"_target_": "simulators.racecar.RaceCar", "name": "racecar", "inputs": {"steer": {"delay": "T"}}}
+    after = {
+        "_target_": "simulators.extended.Extended", "name": "more", "base": before,
+        "inputs": {"throttle": {"value": "a*throttle"}}, "dynamics": {"omega": "(-c*omega)"},
+    }  # fmt: skip
+    old, new = equation_section(searches.verdict("effect"), before, after)["equations"]
+    assert [[text for text, _ in line] for line in old["lines"]] == [
+        ["d(omega)/dt = [as in racecar]"],
+        ["steer acts as steer(t - T)"],
+    ]
+    lines = ["".join(text for text, _ in line) for line in new["lines"]]
+    assert lines == [
+        "d(omega)/dt = [as in racecar] + (-c*omega)",
+        "steer acts as steer(t - T)",
+        "throttle acts as a*throttle",
+    ]
+    assert [new["lines"][k][0][1] for k in (1, 2)] == [False, True]  # the delay was there before

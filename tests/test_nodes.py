@@ -118,3 +118,12 @@ class TestBuild:
     def test_role_of_a_group(self) -> None:
         with pytest.raises(ConfigError, match=r"sim\._target_: simpel_cli\.gp\.Matern32 is no sim"):
             build({"_target_": "simpel_cli.gp.Matern32"}, "sim")
+
+
+@pytest.mark.parametrize(
+    ("path", "target"),
+    [("sim", "simulators.built.Built"), ("method", "simpel_cli.methods.function_space.FunctionSpace")],
+)
+def test_a_base_of_others_is_named_as_such(path: str, target: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{path}\._target_: {target} is a base of others, .* as conf/{path}/ does"):
+        build({"_target_": target, "name": "x", "dt": 1}, path)

@@ -1,12 +1,14 @@
 """The scripts that reproduce the paper's panels: what is paired, what is claimed, which fits there are."""
 
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
 from tests.reproduce import panel_a, panel_b
-from tests.reproduce.panel import Cell, Table, advantage, best_of, draw, judged, markdown, scales, verdict
+from tests.reproduce.panel import WORDS, Cell, Fit, Table, advantage, best_of, draw, judged, markdown, scales, verdict
+from tests.reproduce.panel import _done as done
 
 NAN = float("nan")
 
@@ -118,3 +120,21 @@ def test_figure_and_table(tmp_path: Path) -> None:
     lines = markdown(found, ["s"])
     assert "| simpel | **-5.05 ± 0.071** |" in lines
     assert "| fsvgd | 30.5 ± 0.71 |" in lines
+
+
+def test_a_fit_of_other_words_is_another_fit(tmp_path: Path) -> None:
+    fit = Fit("s", "simpel", 10, 0, ("method=simpel", "method.steps=5"))
+    where = tmp_path / fit.name
+    where.mkdir()
+    (where / "manifest.json").write_text('{"status": "done", "command": "fit"}')
+    assert not done(fit, tmp_path)
+    (where / WORDS).write_text("method=simpel\nmethod.steps=5\n")
+    assert done(fit, tmp_path)
+    assert not done(fit._replace(words=("method=simpel", "method.steps=6")), tmp_path)
+
+
+@pytest.mark.parametrize("panel", [panel_a, panel_b])
+def test_what_a_panel_can_be_asked_for(panel: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["panel", "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        panel.main()

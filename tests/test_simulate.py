@@ -356,13 +356,18 @@ def test_a_time_of_its_own_needs_rows_without_time() -> None:
     assert "t" in Simulate(episodes=1, steps=3, layout="transitions").run(timed).columns
 
 
-def test_trajectories_follow_late_inputs() -> None:
-    """v' = u(t - 0.25 s) from rest: position by hand, the first input held before the record."""
-    late = Declared(
+def late_model(low: float, high: float) -> Model:
+    """v' = u, with an input that is late by an uncertain d."""
+    return Declared(
         "late", dt=0.1, substeps=1, states={"v": {"unit": "m/s", "range": [0, 0.1]}},
         inputs={"u": {"unit": "V", "range": [-1, 1], "delay": "d"}},
-        parameters={"d": {"unit": "s", "range": [0.25, 0.2500001]}}, dynamics={"v": "u"},
+        parameters={"d": {"unit": "s", "range": [low, high]}}, dynamics={"v": "u"},
     ).model()  # fmt: skip
+
+
+def test_trajectories_follow_late_inputs() -> None:
+    """v' = u(t - 0.25 s) from rest: position by hand, the first input held before the record."""
+    late = late_model(0.25, 0.2500001)
     made = Simulate(episodes=2, steps=30, initial={"v": [0, 0]}, truth={"d": 0.25}).run(late).columns
     u, v = made["u"].reshape(2, 30), made["v"].reshape(2, 30)
     before = np.concatenate([np.repeat(u[:, :1], 3, axis=1), u], axis=1)
@@ -398,11 +403,7 @@ def test_driver_changes_its_mind_and_stays_within_the_range() -> None:
 
 def test_a_delay_beyond_its_range_holds_the_first_input() -> None:
     """A truth that the prior did not foresee: 0.5 s where at most 0.2 s were declared; nothing wraps to newer inputs."""
-    late = Declared(
-        "late", dt=0.1, substeps=1, states={"v": {"unit": "m/s", "range": [0, 0.1]}},
-        inputs={"u": {"unit": "V", "range": [-1, 1], "delay": "d"}},
-        parameters={"d": {"unit": "s", "range": [0.1, 0.2]}}, dynamics={"v": "u"},
-    ).model()  # fmt: skip
+    late = late_model(0.1, 0.2)
     made = Simulate(episodes=2, steps=30, initial={"v": [0, 0]}, truth={"d": 0.5}).run(late).columns
     u, v = made["u"].reshape(2, 30), made["v"].reshape(2, 30)
     before = np.concatenate([np.repeat(u[:, :1], 5, axis=1), u], axis=1)

@@ -104,7 +104,7 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
     """Right-hand sides before and after, with what is new marked."""
     old, new = _rates(before), _rates(after) if after is not None else {}
     for state in new:
-        old.setdefault(state, f"[as in {before.get('name')}]")
+        old.setdefault(state, _as_in(before))
     if not (old or _timing(after or {})):
         return {}
     timing = _timing(before)
@@ -128,15 +128,19 @@ def _rates(sim: Mapping[str, Any]) -> dict[str, str]:
     if not isinstance(base := sim.get("base"), Mapping):
         return rates
     own = _rates(base)
-    inputs = [f"{name} for {node['value']}" for name, node in (sim.get("inputs") or {}).items() if "value" in node]
-    words = f"[as in {base.get('name')}{', with ' + ', '.join(inputs) if inputs else ''}]"
-    return own | {s: f"{own.get(s, words)} + {e}" for s, e in rates.items()}
+    return own | {s: f"{own.get(s, _as_in(base))} + {e}" for s, e in rates.items()}
+
+
+def _as_in(sim: Mapping[str, Any]) -> str:
+    return f"[as in {sim.get('name')}]"
 
 
 def _timing(sim: Mapping[str, Any]) -> list[str]:
-    """Say how late and how slowly inputs act."""
-    lines = []
+    """Say how inputs act otherwise than they are given: changed, late or slowly."""
+    lines = _timing(base) if isinstance(base := sim.get("base"), Mapping) else []
     for name, node in (sim.get("inputs") or {}).items():
+        if "value" in node:
+            lines.append(f"{name} acts as {node['value']}")
         if "delay" in node:
             lines.append(f"{name} acts as {name}(t - {node['delay']})")
         if "lag" in node:

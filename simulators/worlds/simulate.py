@@ -17,6 +17,7 @@ import numpy as np
 from simulators.expression import did_you_mean
 from simulators.model import Model, ModelError, Quantity
 from simulators.parameters import draw
+from simulators.quantity import check_word
 from simulators.worlds.excitation import Excitation, HeldRandom
 from simulators.worlds.rk4 import RK4
 from simulators.worlds.world import World
@@ -86,11 +87,8 @@ class Simulate:
         for key, least in (("episodes", 1), ("steps", 1), ("seed", 0)):
             if getattr(self, key) < least:
                 raise ModelError(f"simulation.{key}: {getattr(self, key)} is not allowed; give at least {least}")
-        for key, allowed in (("layout", LAYOUTS), ("noise_on", NOISE_ON)):
-            if getattr(self, key) not in allowed:
-                raise ModelError(
-                    f"simulation.{key}: {getattr(self, key)!r} is not allowed, only {' or '.join(allowed)}"
-                )
+        check_word("simulation.layout", self.layout, LAYOUTS)
+        check_word("simulation.noise_on", self.noise_on, NOISE_ON)
         if not 0 <= self.test_fraction < 1:
             raise ModelError(f"simulation.test_fraction: {self.test_fraction:g} is not allowed; give 0 <= fraction < 1")
         for name, std in self.noise_std.items():

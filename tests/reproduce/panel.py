@@ -3,6 +3,7 @@
 A fit is what `simpel fit` does with the words of the job; its directory keeps the configuration, the manifest and the metrics.
 """
 
+import argparse
 import itertools
 import multiprocessing
 import os
@@ -68,7 +69,25 @@ class Cell(NamedTuple):
         return float(np.nanstd(means, ddof=1)) if len(means) > 1 else 0.0
 
 
+STEPS = {
+    "greybox": "method.residual.steps",
+    "sysid": None,
+    "gp": None,
+}  # where not method.steps; None: trains no network
 Table = dict[tuple[str, str, int], Cell]  # (system, method, n_train)
+
+
+def options(name: str, about: str | None, methods: Iterable[str]) -> argparse.ArgumentParser:
+    """Return what a panel can be asked for."""
+    parser = argparse.ArgumentParser(prog=f"tests.reproduce.{name}", description=about)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--size", choices=("small", "full"), default="small")
+    parser.add_argument("--methods", nargs="+", choices=list(methods), default=list(methods))
+    parser.add_argument("--data-seeds", type=int, help="small: 2, full: 5")
+    parser.add_argument("--model-seeds", type=int, help="small: 1, full: 5")
+    parser.add_argument("--steps", type=float, help="share of the number of steps; small: 0.3")
+    parser.add_argument("--processes", type=int, default=2)
+    return parser
 
 
 def run(fits: Sequence[Fit], out: Path, processes: int) -> None:

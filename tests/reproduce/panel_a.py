@@ -8,7 +8,6 @@ every method that learns a network. On sergio those with a prior over functions 
 direction (WIDE); SVGD has neither.
 """
 
-import argparse
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ from simpel_cli.config import launch
 from simpel_cli.records import write_text
 from tests.reproduce.panel import (
     CONF,
+    STEPS,
     Fit,
     Table,
     advantage,
@@ -27,6 +27,7 @@ from tests.reproduce.panel import (
     draw,
     markdown,
     methods_of,
+    options,
     run,
     sizes_of,
     verdict,
@@ -150,7 +151,7 @@ def fits(
                     "prior.gap.lengthscale=10",
                     "prior.gap.lengthscale_units=raw",
                 )
-            key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
+            key = STEPS.get(method, "method.steps")
             for n in system.small if small else system.sizes:
                 # as published 60 passes of 8 rows beside 5000 steps; there are fewer in the small panel
                 steps = max(1, round(share * (system.steps if small else min(60 * n // 8 + system.steps, 100_000))))
@@ -219,28 +220,21 @@ def claims(table: Table, systems: list[str]) -> list[str]:
 
 def main() -> None:
     """Fit, draw and judge."""
-    parser = argparse.ArgumentParser(prog="tests.reproduce.panel_a", description=__doc__)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--size", choices=("small", "full"), default="small")
+    parser = options("panel_a", __doc__, METHODS)
     parser.add_argument("--setting", choices=list(SETTINGS), default="informative")
     parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--data-seeds", type=int)
-    parser.add_argument("--model-seeds", type=int)
-    parser.add_argument("--steps", type=float, help="share of the number of steps; small: 0.3")
-    parser.add_argument("--processes", type=int, default=2)
-    options = parser.parse_args()
-    small = options.size == "small"
-    out = folder(options.out, f"panel_a_{options.setting}_{options.size}")
+    asked = parser.parse_args()
+    small = asked.size == "small"
+    out = folder(asked.out, f"panel_a_{asked.setting}_{asked.size}")
     every = fits(
-        options.setting, options.systems, options.methods,
-        options.data_seeds or (2 if small else 5), options.model_seeds or (1 if small else 5),
-        small, options.steps or (0.3 if small else 1.0), out,
+        asked.setting, asked.systems, asked.methods,
+        asked.data_seeds or (2 if small else 5), asked.model_seeds or (1 if small else 5),
+        small, asked.steps or (0.3 if small else 1.0), out,
     )  # fmt: skip
-    run(every, out, options.processes)
+    run(every, out, asked.processes)
     tables = collect(every, out, "panel_a")
     table = tables["nll"]
-    systems = [name for name in options.systems if sizes_of(table, name)]
+    systems = [name for name in asked.systems if sizes_of(table, name)]
     draw(out / "panel_a.png", [(name, "nll", table) for name in systems], {"nll": "test NLL [nat]"}, columns=2)
     lines = [
         SPREAD,

@@ -7,13 +7,11 @@ test row is trained on. Seven past commands go into every network. Low fidelity:
 fidelity: Pacejka tyres and commands that act late.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 
 from simpel_cli.records import write_text
 from tests.reproduce.panel import (
+    STEPS,
     Fit,
     Table,
     advantage,
@@ -22,6 +20,7 @@ from tests.reproduce.panel import (
     draw,
     markdown,
     methods_of,
+    options,
     run,
     sizes_of,
     verdict,
@@ -53,7 +52,7 @@ def fits(methods: list[str], data_seeds: int, model_seeds: int, small: bool, sha
     every = []
     for name in methods:
         method, sim = METHODS[name]
-        key = {"greybox": "method.residual.steps", "sysid": None, "gp": None}.get(method, "method.steps")
+        key = STEPS.get(method, "method.steps")
         for n in SMALL if small else SIZES:
             # as published: 60 passes of 8 rows beside 5000 steps
             steps = (
@@ -100,25 +99,18 @@ def claims(nll: Table, error: Table) -> list[str]:
 
 def main() -> None:
     """Fit, draw and judge."""
-    parser = argparse.ArgumentParser(prog="tests.reproduce.panel_b", description=__doc__)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--size", choices=("small", "full"), default="small")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    parser.add_argument("--data-seeds", type=int)
-    parser.add_argument("--model-seeds", type=int)
-    parser.add_argument("--steps", type=float, help="share of the number of steps; small: 0.3")
-    parser.add_argument("--processes", type=int, default=2)
-    options = parser.parse_args()
-    small = options.size == "small"
-    out = folder(options.out, f"panel_b_{options.size}")
+    parser = options("panel_b", __doc__, METHODS)
+    asked = parser.parse_args()
+    small = asked.size == "small"
+    out = folder(asked.out, f"panel_b_{asked.size}")
     every = fits(
-        options.methods,
-        options.data_seeds or (2 if small else 5),
-        options.model_seeds or (1 if small else 5),
+        asked.methods,
+        asked.data_seeds or (2 if small else 5),
+        asked.model_seeds or (1 if small else 5),
         small,
-        options.steps or (0.3 if small else 1.0),
+        asked.steps or (0.3 if small else 1.0),
     )
-    run(every, out, options.processes)
+    run(every, out, asked.processes)
     tables = collect(every, out, "panel_b")
     labels = {"nll": "test NLL [nat]", "nrmse": "test RMSE, normalised"}
     draw(out / "panel_b.png", [(SYSTEM, metric, tables[metric]) for metric in labels], labels, columns=2)
