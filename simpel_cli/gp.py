@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 
 @runtime_checkable
@@ -22,6 +22,15 @@ class Kernel(Protocol):
         ...
 
 
+@runtime_checkable
+class Spectral(Kernel, Protocol):
+    """A kernel whose sample paths can be drawn."""
+
+    def frequencies(self, key: PRNGKeyArray, count: int, dim: int) -> Float[Array, "count dim"]:
+        """Draw angular frequencies from the spectral density, per lengthscale."""
+        ...
+
+
 @dataclass(frozen=True)
 class SquaredExponential:
     """Infinitely smooth: rho(r) = exp(-r^2 / 2)."""
@@ -29,6 +38,10 @@ class SquaredExponential:
     def correlation(self, squared_distance: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return rho at squared distances in units of the lengthscale."""
         return jnp.exp(-0.5 * squared_distance)
+
+    def frequencies(self, key: PRNGKeyArray, count: int, dim: int) -> Float[Array, "count dim"]:
+        """Draw from the spectral density, normal; Rasmussen and Williams (2006), section 4.2.1."""
+        return jax.random.normal(key, (count, dim), jnp.float64)
 
 
 @dataclass(frozen=True)
@@ -40,6 +53,10 @@ class Matern32:
         r = _root(3.0 * squared_distance)
         return (1.0 + r) * jnp.exp(-r)
 
+    def frequencies(self, key: PRNGKeyArray, count: int, dim: int) -> Float[Array, "count dim"]:
+        """Draw from the spectral density, Student's t with 3 degrees of freedom."""
+        return _student(key, count, dim, 3.0)
+
 
 @dataclass(frozen=True)
 class Matern52:
@@ -49,6 +66,17 @@ class Matern52:
         """Return rho at squared distances in units of the lengthscale."""
         r = _root(5.0 * squared_distance)
         return (1.0 + r + r * r / 3.0) * jnp.exp(-r)
+
+    def frequencies(self, key: PRNGKeyArray, count: int, dim: int) -> Float[Array, "count dim"]:
+        """Draw from the spectral density, Student's t with 5 degrees of freedom."""
+        return _student(key, count, dim, 5.0)
+
+
+def _student(key: PRNGKeyArray, count: int, dim: int, freedom: float) -> Float[Array, "count dim"]:
+    """Draw from the multivariate t: the spectral density of a Matern kernel; Rasmussen and Williams (2006), eq. 4.15."""
+    key_normal, key_gamma = jax.random.split(key)
+    normal = jax.random.normal(key_normal, (count, dim), jnp.float64)
+    return normal * jnp.sqrt(freedom / 2 / jax.random.gamma(key_gamma, freedom / 2, (count, 1), jnp.float64))
 
 
 def _root(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -123,13 +123,13 @@ class Info(NamedTuple):
 class Inference(NamedTuple):
     """An inference rule bound to a problem; every function is pure.
 
-    init(key) -> State; draw(key) -> random material for a stretch of steps that is not worth keeping;
+    init(key) -> State; draw(key, State at its beginning) -> material for a stretch of steps that is not worth keeping;
     step(key, State, what was drawn) -> (State, Info); predict(State, x in data units) -> Predictive in data units;
     members(State, x of every particle) -> targets of every particle, for roll-outs along each particle's own path.
     """
 
     init: Callable[[PRNGKeyArray], Any]
-    draw: Callable[[PRNGKeyArray], Any]
+    draw: Callable[[PRNGKeyArray, Any], Any]
     step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
     predict: Callable[[Any, Float[Array, "n dx"]], Predictive]
     members: Callable[[Any, Float[Array, "L n dx"]], Float[Array, "L n dy"]]

@@ -16,10 +16,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 Numbers = Array | np.ndarray
+MOST_ROWS = 512  # whose marginal likelihood is taken: time grows as their third power
 NOISES = 41  # levels that are tried, from the floor to the targets' spread
 LONGER = 1.0, 2.0, 4.0, 8.0, 16.0  # lengthscales that are tried, over the declared one
 SCALES = 1e-3, 10.0, 41  # that are tried: first, last, how many
 TYPICAL_SCALE, SPREAD_OF_SCALES = 0.1, 2.0  # log kappa ~ N(log 0.1, 2^2), which decides where few data do not
+
+
+def evenly(padded: int, rows: Int[Numbers, ""], most: int) -> tuple[Int[Array, " c"], Int[Array, ""]]:
+    """Return which rows to look at, no more than `most`, evenly, and how many of them are data, which come first.
+
+    Args:
+        padded: number of rows with padding.
+        rows: number of data.
+        most: how many to look at.
+    """
+    every, count = jnp.arange(min(padded, most), dtype=jnp.int32), jnp.asarray(rows)
+    apart = jnp.maximum(count.astype(jnp.float64) / most, 1.0)
+    return jnp.floor(every.astype(jnp.float64) * apart).astype(jnp.int32), jnp.minimum(count, most)
 
 
 class Spectrum(NamedTuple):

@@ -30,8 +30,8 @@ class Rule(Protocol):
         ...
 
     @property
-    def draw(self) -> Callable[[PRNGKeyArray], Any]:
-        """Key to the random material of a stretch."""
+    def draw(self) -> Callable[[PRNGKeyArray, Any], Any]:
+        """Key and state at its beginning to what a stretch of steps works on."""
         ...
 
     @property
@@ -73,7 +73,7 @@ def compiled(bind: Callable[[Any], Rule], problems: Any, keys: Key[Array, " seed
         def one(problem: Any, key: PRNGKeyArray, state: Any) -> tuple[Any, Any]:
             rule = bind(problem)
             key_draw, key_step = jax.random.split(key)
-            draws = rule.draw(jax.random.fold_in(key_draw, start))
+            draws = rule.draw(jax.random.fold_in(key_draw, start), state)
 
             def body(i: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
                 state, infos = carry

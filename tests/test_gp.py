@@ -7,7 +7,7 @@ import oracles
 import pytest
 
 from simpel_cli.gap import marginal_likelihood_scales
-from simpel_cli.gp import Kernel, Matern32, Matern52, SquaredExponential, gram, posterior
+from simpel_cli.gp import Kernel, Matern32, Matern52, Spectral, SquaredExponential, gram, posterior
 
 # Rasmussen and Williams (2006), eqs. 4.9 and 4.17, as functions of the distance r in lengthscales
 FORMULAS = [
@@ -43,6 +43,15 @@ def test_gradient_vanishes_where_points_coincide(kernel: Kernel) -> None:
     np.testing.assert_array_equal(slope, 0)
     away = jax.grad(lambda a: jnp.sum(gram(kernel, a, x)))(x + 0.1)
     assert np.all(away < -1e-3)  # the correlation falls with distance
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_frequencies_are_those_of_the_kernel(kernel: Spectral) -> None:
+    """Bochner: rho(r) is the mean of cos(w r)."""
+    w = np.asarray(kernel.frequencies(jax.random.key(0), 200_000, 3))
+    for r in (0.1, 0.7, 2.0):
+        apart = np.array([0.6, -0.8, 0.0]) * r
+        np.testing.assert_allclose(np.cos(w @ apart).mean(), kernel.correlation(jnp.asarray(r**2)), atol=0.006)
 
 
 def test_posterior() -> None:

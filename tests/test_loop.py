@@ -37,7 +37,7 @@ def bind(target: jax.Array) -> Descent:
 
     return Descent(
         lambda key: jax.random.normal(key, (DIM,), jnp.float64),
-        lambda key: 0.01 * jax.random.normal(key, (DIM,), jnp.float64),
+        lambda key, state: 0.01 * jax.random.normal(key, (DIM,), jnp.float64),
         step,
     )
 
@@ -122,7 +122,7 @@ def breaking_at(number: int) -> Any:
             bad = (n + 1 >= number) & (seed == 1)
             return n + 1, Info(jnp.where(bad, jnp.inf, 0.0), *[jnp.zeros(2)] * 3)
 
-        return Descent(lambda key: jnp.int32(0), lambda key: jnp.zeros(()), step)
+        return Descent(lambda key: jnp.int32(0), lambda key, n: jnp.zeros(()), step)
 
     return rule
 

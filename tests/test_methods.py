@@ -17,6 +17,7 @@ from simpel_cli.methods.exact_gp import ExactGP
 from simpel_cli.methods.fmap import FunctionMAP
 from simpel_cli.methods.fsvgd import FSVGD, stein_velocity
 from simpel_cli.methods.greybox import GreyBox
+from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.methods.preconditioner import preconditioned
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
@@ -65,7 +66,8 @@ def setting_of(prior: FunctionPrior) -> Setting:
 
 def run(rule: Inference, steps: int, seed: int = 0) -> Any:
     key = jax.random.key(seed)
-    state, draws = rule.init(key), rule.draw(jax.random.fold_in(key, 1))
+    state = rule.init(key)
+    draws = rule.draw(jax.random.fold_in(key, 1), state)
 
     def body(i: Any, state: Any) -> Any:
         return rule.step(jax.random.fold_in(key, i), state, draws)[0]
@@ -254,7 +256,7 @@ def test_the_scale_of_what_greybox_learns_is_what_the_simulator_leaves(wave: flo
     state = rule.init(jax.random.key(0))
     assert 0.3 * wave <= float(state.scale[0]) <= max(2 * wave, 0.01)
     assert 0.007 < float(state.noise_floor[0]) < 0.014  # that of the problem is 0.001
-    _, info = rule.step(jax.random.key(1), state, rule.draw(jax.random.key(2)))
+    _, info = rule.step(jax.random.key(1), state, rule.draw(jax.random.key(2), state))
     np.testing.assert_allclose(info.noise_std, NOISE, rtol=1e-3)  # in the units of the targets
     close = jax.tree.map(lambda a: 0 * a, state.residual.particles)
     nothing = rule.predict(state._replace(residual=state.residual._replace(particles=close)), jnp.asarray(x))
@@ -378,7 +380,8 @@ def test_a_prior_without_a_simulator_is_centred_on_the_mean_of_the_normaliser() 
     without = GPPrior().bind(None, 1, 1, np.ones(1))
 
     def centre(prior: FunctionPrior) -> np.ndarray:
-        (mean, _) = jax.tree.leaves(method.bind(setting_of(prior), problem).draw(jax.random.key(0)).score)
+        rule, key = method.bind(setting_of(prior), problem), jax.random.key(0)
+        (mean, _) = jax.tree.leaves(rule.draw(key, rule.init(key)).score)
         return np.asarray(mean)
 
     np.testing.assert_array_equal(centre(without), 0.0)
@@ -394,7 +397,8 @@ def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of
         particles=3, network=MLP((8,)), batch=4, fresh_points=4, pool=256, sets=sets, precondition=precondition
     )
     rule = method.bind(setting_of(prior), problem)
-    drawn, state = rule.draw(jax.random.key(0)), rule.init(jax.random.key(1))
+    state = rule.init(jax.random.key(1))
+    drawn = rule.draw(jax.random.key(0), state)
     assert drawn.x.shape == (sets, 8, 1)
     assert len(np.unique(np.asarray(drawn.x[:, 4:]))) > 4 * 4  # fresh points of every set are its own
     _, precision = jax.tree.leaves(drawn.score)
@@ -420,6 +424,7 @@ EVERY = {
     "svgd": SVGD(steps=6, **SMALL), "sysid": SysID(steps=6, starts=2, particles=3),
     "gp": ExactGP(sysid=SysID(steps=6, starts=2), particles=3),
     "greybox": GreyBox(SysID(steps=6, starts=2), FSVGD(steps=6, **FEW)),
+    "pathwise": Pathwise(steps=6, features=16, pool=8, **SMALL),
 }  # fmt: skip
 
 

@@ -127,4 +127,4 @@ class ExactGP:
 
             return scale.y_to_data(jax.vmap(one)(x, quantiles()))
 
-        return Inference(init, lambda key: None, step, predict, members)
+        return Inference(init, lambda key, state: None, step, predict, members)

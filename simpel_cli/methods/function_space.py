@@ -122,7 +122,7 @@ class FunctionSpace(ABC):
         count = max(self.sets, min(-(-n_rows // self.batch), MOST_SETS))
         networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
-        def draw(key: PRNGKeyArray) -> Sets:
+        def draw(key: PRNGKeyArray, state: State) -> Sets:
             key_bank, key_sets = jax.random.split(key)
             x, samples = bank(key_bank)
 

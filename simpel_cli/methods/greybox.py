@@ -16,14 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
-from simpel_cli.likeliest import likeliest, noise_of_smooth, spectrum
+from simpel_cli.likeliest import MOST_ROWS, evenly, likeliest, noise_of_smooth, spectrum
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.predictive import Predictive
 from simpel_cli.prior import GPPrior
 from simpel_cli.scores.gaussian import Gaussian
-
-MOST_ROWS = 512  # of which the marginal likelihood is taken
 
 
 class State(NamedTuple):
@@ -109,9 +107,7 @@ class GreyBox:
             floors = noise.learn and noise.marginal_share > 0 and len(problem.x) <= MOST_ROWS
             if kappa is not None and not floors:
                 return kappa, jnp.asarray(problem.noise_floor)
-            rows, m = jnp.arange(len(problem.x), dtype=problem.m.dtype), jnp.asarray(problem.m)
-            if len(rows) > MOST_ROWS:  # padding is to powers of two: so many of the data, evenly
-                rows, m = rows[:MOST_ROWS] * m // MOST_ROWS, jnp.minimum(m, MOST_ROWS)
+            rows, m = evenly(len(problem.x), problem.m, MOST_ROWS)
             x, y = scale.x(jnp.asarray(problem.x)[rows]), left(predicted)[rows]
             init, floor = problem.noise_init, problem.noise_floor
 
@@ -143,8 +139,8 @@ class GreyBox:
             first = State(phi, predicted, *likely(predicted), None)
             return first._replace(residual=second(first).init(key_second))
 
-        def draw(key: PRNGKeyArray) -> Any:
-            return self.residual.bind(own, frame).draw(key)
+        def draw(key: PRNGKeyArray, state: State) -> Any:
+            return self.residual.bind(own, frame).draw(key, state.residual)
 
         def step(key: PRNGKeyArray, state: State, draws: Any) -> tuple[State, Info]:
             after, info = second(state).step(key, state.residual, draws)

@@ -88,7 +88,7 @@ class SVGD:
             info = Info(-value / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
             return after, info
 
-        return Inference(networks.init, lambda key: None, step, networks.predict, networks.members)
+        return Inference(networks.init, lambda key, state: None, step, networks.predict, networks.members)
 
     def log_prior(self, particles: Particles) -> Float[Array, ""]:
         """Return the sum over particles of the log density of their weights, up to a constant."""

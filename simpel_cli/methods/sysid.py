@@ -190,7 +190,7 @@ class SysID:
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
             return scale.y_to_data(jax.vmap(simulated)(drawn(state)[0], x))
 
-        return Inference(init, lambda key: None, step, predict, members)
+        return Inference(init, lambda key, state: None, step, predict, members)
 
 
 def identified(method: SysID, setting: Setting, problem: Problem, key: PRNGKeyArray) -> Float[Array, " dp"]:

@@ -1,0 +1,266 @@
+"""Pathwise conditioning: networks learn sample paths of the posterior, drawn in closed form, by regression.
+
+    h_l(x) = f_l(x) + c(x, X) (C + (w + sigma^2) I)^-1 (y + e_l - f_l(X)),    e_l ~ N(0, (w + sigma^2) I)
+
+per output, where f_l = g(., phi_l) + h~_l is a draw of the prior and c its covariance: that of draws of the simulator plus the
+gap's kernel. Where the prior is Gaussian h_l is a draw of the posterior, exactly; where it is not, the best update of a draw
+that is linear in the data. Function-space inference under the `gaussian` score converges to that, too, but nothing here is
+stiff: a network regresses on one function, whatever the eigenvalues of C. kappa and sigma are those of the largest marginal
+likelihood.
+
+Reference: Wilson et al. (2020), Efficiently sampling functions from Gaussian process posteriors, eqs. 8-13; Matheron's rule in
+Journel and Huijbregts (1978); Rahimi and Recht (2007), Random features for large-scale kernel machines (the gap's paths);
+Evensen (1994) for draws of a simulator.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from simpel_cli.errors import ConfigError
+from simpel_cli.gp import Spectral, gram
+from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.likeliest import MOST_ROWS, Spectrum, evenly, likeliest
+from simpel_cli.methods import networks as nets
+from simpel_cli.methods.networks import Networks
+from simpel_cli.nets import MLP
+from simpel_cli.prior import FunctionPrior
+
+
+class Paths(NamedTuple):
+    """Sample paths of the posterior, float64.
+
+    Args:
+        key: data of the key that the prior's draws come from.
+        along: coefficients of the simulator's draws, about their mean.
+        at: coefficients of the kernel at the rows that are conditioned on.
+    """
+
+    key: Int[Array, " words"]
+    along: Float[Array, "dy N L"]
+    at: Float[Array, "dy c L"]
+
+
+class State(NamedTuple):
+    """What the data say, and the networks that learn it."""
+
+    paths: Paths
+    networks: nets.State
+
+
+class Targets(NamedTuple):
+    """Values of the paths at points of a stretch: the domain's, then the data's.
+
+    Args:
+        x: normalised.
+        h: normalised.
+    """
+
+    x: Float[Array, "n dx"]
+    h: Float[Array, "L n dy"]
+
+
+@dataclass(frozen=True)
+class Pathwise:
+    """Networks that regress on sample paths of the posterior.
+
+    Args:
+        steps: of the regression.
+        particles: paths and networks, L.
+        network: architecture.
+        learning_rate: of Adam, at the start.
+        final_learning_rate: fraction of it that is left at the last step, along a cosine.
+        batch: points per step, of the domain and of the data.
+        pool: points of the domain that a stretch of steps chooses from.
+        features: of a path of the gap.
+        most_rows: training rows that are conditioned on, at most, evenly chosen; time grows as their third power.
+        noise: observation noise; learned: that of the largest marginal likelihood.
+    """
+
+    steps: int = 5000
+    particles: int = 20
+    network: MLP = MLP()
+    learning_rate: float = 1e-2
+    final_learning_rate: float = 0.01
+    batch: int = 96
+    pool: int = 1024
+    features: int = 2000
+    most_rows: int = 2048
+    noise: NoiseModel = NoiseModel()
+
+    uses_score = False  # not a field: the law of Gaussian values is known
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "particles", "batch", "pool", "features", "most_rows"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        if not self.learning_rate > 0:
+            raise ConfigError(f"method.learning_rate: got {self.learning_rate}; it must be positive.")
+
+    def bind(self, setting: Setting, problem: Problem) -> Inference:
+        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+
+        Raises:
+            ConfigError: the prior has too few draws, or a kernel whose paths cannot be drawn.
+        """
+        prior = self._prior_of(setting)
+        scale, dtype = problem.normaliser, problem.x.dtype
+        n_rows, dim_y = problem.y.shape
+        kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
+        fixed = replace(self.noise, learn=False)  # by marginal likelihood, before the first step
+        networks = Networks(self.particles, self.network, fixed, optax.adam(rate), problem)
+
+        rows, count = evenly(n_rows, jnp.asarray(problem.m), self.most_rows)
+        counts = (jnp.arange(len(rows), dtype=jnp.int32) < count).astype(jnp.float64)
+        known = scale.x(jnp.asarray(problem.x)[rows])
+
+        def simulated(
+            key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: slice | Int[Array, " n"]
+        ) -> Float[Array, "n dy N"]:
+            """Draws at inputs in data units, which are these rows of a bank, normalised; those of the paths first."""
+            if problem.bank is not None:
+                draws = jnp.asarray(problem.bank.samples)[at]
+            elif prior.simulates:
+                draws = jnp.moveaxis(prior.simulate(key, jnp.asarray(x), prior.draws), 0, -1)
+            else:
+                return jnp.zeros((len(x), dim_y, self.particles + 2), dtype)
+            return (draws - scale.y_mean[None, :, None]) / scale.y_std[None, :, None]
+
+        def scaled(x: Float[Array, "n dx"]) -> Float[Array, "n dx"]:
+            return (x * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
+
+        def prior_paths(
+            key: PRNGKeyArray, x: Float[Array, "n dx"], draws: Float[Array, "n dy N"]
+        ) -> Float[Array, "n dy L"]:
+            """Paths of the prior at normalised inputs."""
+            own = draws[:, :, : self.particles].astype(jnp.float64)
+            if prior.kernel is None:
+                return own
+            key_frequency, key_phase, key_weight = jax.random.split(key, 3)
+            assert isinstance(prior.kernel, Spectral)
+            frequency = prior.kernel.frequencies(key_frequency, self.features, x.shape[1])
+            phase = jax.random.uniform(key_phase, (self.features,), jnp.float64, 0, 2 * jnp.pi)
+            wave = jnp.sqrt(2 / self.features) * jnp.cos(scaled(x) @ frequency.T + phase[None])
+            weights = self._paired(key_weight, (self.features, dim_y))
+            # the one large product of a stretch: single precision is enough for a path
+            gap = jnp.einsum("nf,lfd->ndl", wave.astype(dtype), weights.astype(dtype))
+            return own + kappa[None, :, None] * gap.astype(jnp.float64)
+
+        def centred(draws: Float[Array, "n dy N"]) -> Float[Array, "dy n R"]:
+            """Draws that the covariance is taken of, over the root of their number less one."""
+            rest = jnp.moveaxis(draws[:, :, self.particles :].astype(jnp.float64), 1, 0)
+            return (rest - jnp.mean(rest, axis=2, keepdims=True)) / (rest.shape[2] - 1) ** 0.5
+
+        def likeliest_noise(draws: Float[Array, "dy c N"], mean: Float[Array, "c dy"]) -> Float[Array, " dy"]:
+            """Noise of the largest marginal likelihood, normalised."""
+            few, _ = evenly(len(rows), count, MOST_ROWS)
+            real, left = counts[few], (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
+            correlation = correlations(known[few], known[few])
+
+            def of_output(
+                given: tuple[
+                    Float[Array, "c N"], Float[Array, " c"], Float[Array, ""], Float[Array, ""], Float[Array, ""]
+                ],
+            ) -> Float[Array, ""]:
+                own, left, kappa, floor, typical = given
+                law = (own @ own.T + kappa**2 * correlation) * real[:, None] * real[None]
+                values, vectors = jnp.linalg.eigh(law)
+                turned = vectors.T @ (left * real)[:, None]
+                spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(real))
+                one = jnp.ones((1,), jnp.float64)
+                prior_std = self.noise.prior_std if self.noise.learn else None
+                return likeliest(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
+
+            floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
+            found: Array = jax.lax.map(of_output, (draws[:, few], left.T, kappa, floor, typical))
+            return found
+
+        def correlations(x: Float[Array, "n dx"], other: Float[Array, "c dx"]) -> Float[Array, "n c"]:
+            if prior.kernel is None:
+                return jnp.zeros((len(x), len(other)), jnp.float64)
+            return gram(prior.kernel, scaled(x), scaled(other))
+
+        def init(key: PRNGKeyArray) -> State:
+            key_paths, key_noise, key_networks = jax.random.split(key, 3)
+            key_draws, key_gap = jax.random.split(key_paths)
+            draws = simulated(key_draws, jnp.asarray(problem.x)[rows], rows)
+            before = prior_paths(key_gap, known, draws)
+            own = centred(draws)
+            mean = jnp.mean(draws[:, :, self.particles :].astype(jnp.float64), axis=2)
+            sigma = likeliest_noise(own, mean)
+            variance = sigma**2 + prior.white_variance
+            measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
+            noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None, None]
+            left = (measured[:, :, None] + jnp.moveaxis(noise, 0, -1) - before) * counts[:, None, None]
+            correlation = correlations(known, known)
+
+            def of_output(
+                given: tuple[Float[Array, "c N"], Float[Array, "c L"], Float[Array, ""], Float[Array, ""]],
+            ) -> tuple[Float[Array, "N L"], Float[Array, "c L"]]:
+                own, left, kappa, variance = given
+                own = own * counts[:, None]
+                law = own @ own.T + kappa**2 * correlation * counts[:, None] * counts[None]
+                factor = jnp.linalg.cholesky(law + variance * jnp.eye(len(law)))
+                solved = jax.scipy.linalg.cho_solve((factor, True), left)
+                return own.T @ solved, kappa**2 * solved
+
+            along, at = jax.lax.map(of_output, (own, jnp.moveaxis(left, 1, 0), kappa, variance))
+            total = jnp.sqrt(variance).astype(dtype)
+            rho = self.noise.init(total, problem.noise_floor)
+            first = networks.init(key_networks)._replace(noise=rho)
+            return State(Paths(jax.random.key_data(key_paths), along, at), first)
+
+        def draw(key: PRNGKeyArray, state: State) -> Targets:
+            paths = state.paths
+            key_draws, key_gap = jax.random.split(jax.random.wrap_key_data(paths.key))
+            fresh = (
+                setting.sample_inputs(key, self.pool) if problem.bank is None else jnp.asarray(problem.bank.x)[n_rows:]
+            )
+            at = jnp.concatenate([n_rows + jnp.arange(len(fresh), dtype=rows.dtype), rows])
+            points = jnp.concatenate([fresh, jnp.asarray(problem.x)[rows]])
+            x, draws = scale.x(points), simulated(key_draws, points, at)
+            before = prior_paths(key_gap, x, draws)
+            moved = jnp.einsum("dnj,djl->ndl", centred(draws), paths.along)
+            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(x, known) * counts[None], paths.at)
+            return Targets(x, jnp.moveaxis(before + moved, -1, 0).astype(dtype))
+
+        def step(key: PRNGKeyArray, state: State, targets: Targets) -> tuple[State, Info]:
+            fresh = len(targets.x) - len(rows)
+            chosen = jax.random.randint(key, (self.batch,), 0, fresh + count, jnp.int32)
+            h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, targets.x[chosen]), state.networks.particles)
+            sigma = networks.noise_std(state.networks.noise)
+            off = (targets.h[:, chosen] - h) / sigma[None, None]
+            (ascent,) = pull_back(off / sigma[None, None])
+            after = networks.ascended(state.networks, ascent, jnp.zeros_like(sigma))
+            return state._replace(networks=after), Info(0.5 * jnp.mean(off**2), sigma, jnp.zeros((), dtype))
+
+        return Inference(
+            init, draw, step,
+            lambda state, x: networks.predict(state.networks, x), lambda state, x: networks.members(state.networks, x),
+        )  # fmt: skip
+
+    def _prior_of(self, setting: Setting) -> FunctionPrior:
+        prior = setting.prior
+        if not isinstance(prior, FunctionPrior):
+            raise ConfigError("method: pathwise needs prior=simulator, simulator_only or gp.")
+        if (prior.simulates or prior.draws > 2) and prior.draws < self.particles + 2:
+            raise ConfigError(
+                f"prior.draws: got {prior.draws}; method=pathwise needs method.particles ({self.particles}) for its paths and "
+                "at least 2 more for their covariance."
+            )
+        if prior.kernel is not None and not isinstance(prior.kernel, Spectral):
+            raise ConfigError(
+                f"prior.gap.kernel: {type(prior.kernel).__name__} has no `frequencies`, which paths are drawn from; give it "
+                "that method (see simpel_cli/gp.py), or use SquaredExponential, Matern32 or Matern52."
+            )
+        return prior
+
+    def _paired(self, key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "L *shape"]:
+        """Standard normal numbers for every path, in pairs of opposite sign: their mean is that of the posterior."""
+        half = jax.random.normal(key, (-(-self.particles // 2), *shape), jnp.float64)
+        return jnp.concatenate([half, -half])[: self.particles]
