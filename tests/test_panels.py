@@ -53,11 +53,14 @@ def test_errors_of_two_simulators_are_told_on_one_scale() -> None:
             ("rmse", "y", 3.0),
             ("nrmse", "y", 0.3),
             ("nll", "joint", -1.0),
+            ("nll", "x", -2.0),
+            ("nll", "y", 0.5),
         )
     ]
     assert scales(rows) == pytest.approx({"x": 4.0, "y": 10.0})
     assert judged(rows, {"x": 4.0, "y": 10.0}) == [
         (0, "nll", -1.0),
+        (0, "nll_sum", -1.5),
         (0, "nrmse", pytest.approx(np.sqrt((0.25 + 0.09) / 2))),
     ]
 

@@ -28,7 +28,7 @@ NOISE = {
     "rc_car": {"x": 1.1e-3, "y": 1.1e-3, "theta": 1.8e-3, "vx": 8.2e-3, "vy": 8.2e-3, "omega": 3.7e-2},
 }
 METHODS = (
-    "simpel", "simpel_only_sim", "map", "repulsive", "fsvgd", "ensemble", "svgd", "greybox", "sysid", "gp",
+    "simpel", "simpel_only_sim", "pathwise", "map", "repulsive", "fsvgd", "ensemble", "svgd", "greybox", "sysid", "gp",
 )  # fmt: skip
 SCORES = ("gaussian", "kde", "ssge", "nu_method")
 

@@ -24,7 +24,7 @@ from simpel_cli.records import read_metrics, write_table, write_text
 from simpel_cli.run import read_manifest
 
 CONF = Path(__file__).parent / "conf"
-METRICS = ("nll", "nrmse")
+METRICS = ("nll", "nll_sum", "nrmse")
 WORDS = "words.txt"  # of a fit: another fit of the same name is not this one
 
 
@@ -167,9 +167,12 @@ def scales(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def judged(rows: list[dict[str, Any]], scale: dict[str, float]) -> list[tuple[int, str, float]]:
-    """Return (model seed, metric, value): joint NLL, and the root mean square of the errors of all outputs over `scale`."""
+    """Return (model seed, metric, value): joint NLL, the sum of the outputs' own, and the root mean square of the errors of
+    all outputs over `scale`."""
     found = [(r["seed"], "nll", r["value"]) for r in rows if (r["metric"], r["output"]) == ("nll", "joint")]
     for seed in sorted({r["seed"] for r in rows}):
+        alone = [r["value"] for r in rows if r["metric"] == "nll" and r["seed"] == seed and r["output"] != "joint"]
+        found.append((seed, "nll_sum", float(np.sum(alone))))
         own = {r["output"]: r["value"] for r in rows if r["metric"] == "rmse" and r["seed"] == seed}
         found.append((seed, "nrmse", float(np.sqrt(np.mean([(own[name] / s) ** 2 for name, s in scale.items()])))))
     return found
