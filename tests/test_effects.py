@@ -37,6 +37,20 @@ def tanks() -> Model:
     ).model()
 
 
+def room() -> Model:
+    """A room with a heated floor; outdoors and the heating water are measured, the fan is a number between 0 and 1."""
+    return Declared(
+        "room",
+        dt=60.0,
+        states={n: {"unit": "degC", "range": [0, 60]} for n in ("T", "floor")}
+        | {"dust": {"unit": "1", "range": [0, 1]}},
+        inputs={n: {"unit": "degC", "range": [-10, 60]} for n in ("T_o", "water")}
+        | {"fan": {"unit": "1", "range": [0, 1]}},
+        parameters={"a": {"unit": "1/s", "range": [1e-4, 3e-4]}},
+        dynamics={"T": "a*(floor - T)", "floor": "0*a", "dust": "-a*fan*dust"},
+    ).model()
+
+
 def car(frame: str) -> Model:
     """A car that turns where its wheels point: in the world frame, in its own frame, or with one speed."""
     if frame == "world":
@@ -57,21 +71,29 @@ def car(frame: str) -> Model:
     ).model()
 
 
-PENDULUM, TANKS = pendulum(), tanks()
+PENDULUM, TANKS, ROOM = pendulum(), tanks(), room()
 WORLD, BODY, SINGLE = CARS = tuple(car(frame) for frame in ("world", "body", "single"))
 VEHICLE = ("rolling_resistance", "traction_limit", "tyre_slip")
 SCALES = {
     "pendulum": Scales({"phi": 3.0, "omega": 4.0, "u": 2.0}, {"phi": 2.0, "omega": 6.0}, 0.05),
     "tanks": Scales({"h": 0.8, "k": 0.7, "u": 1.0}, {"h": 0.2, "k": 0.1}, 1.0),
-} | {m.name: Scales({q.name: 2.0 for q in (*m.states, *m.inputs)}, {q.name: 3.0 for q in m.states}, m.dt) for m in CARS}
-MEASURED = {m.name: tuple(q.name for q in m.states) for m in (PENDULUM, TANKS, *CARS)}
+} | {
+    m.name: Scales({q.name: 2.0 for q in (*m.states, *m.inputs)}, {q.name: 3.0 for q in m.states}, m.dt)
+    for m in (ROOM, *CARS)
+}
+MEASURED = {m.name: tuple(q.name for q in m.states) for m in (PENDULUM, TANKS, ROOM, *CARS)}
 
 
 def terms_of(name: str) -> list[tuple[Model, Term]]:
     effect = catalogue(name)
     return [
         (model, term)
-        for model in (PENDULUM, TANKS, *(CARS if name in VEHICLE else ()))
+        for model in (
+            PENDULUM,
+            TANKS,
+            *(CARS if name in VEHICLE else ()),
+            *((ROOM,) if name == "input_exchange" else ()),
+        )
         for term in effect.attach(model, SCALES[model.name], MEASURED[model.name])
     ]
 
@@ -356,3 +378,13 @@ def test_wrong_effects_are_refused(fields: dict, message: str) -> None:
 def test_kinds_follow_from_the_place() -> None:
     kinds = {t.effect: t.kind for n in ("input_offset", "sensor_bias", "viscous_friction") for _, t in terms_of(n)}
     assert kinds == {"input_offset": INPUT, "sensor_bias": SENSOR, "viscous_friction": RATE}
+
+
+def test_exchange_with_what_an_input_tells_is_between_temperatures_or_concentrations_only() -> None:
+    terms = catalogue("input_exchange").attach(ROOM, SCALES["room"], MEASURED["room"])
+    x, u = [20.0, 30.0, 0.5], [50.0, 45.0, 0.3]
+    before = np.asarray(ROOM.function()(x, u, augment(ROOM, [], MEASURED["room"]).neutral)[0]).ravel()
+    found = [tuple(values(ROOM, t, x, u, [0.01])[0] - before) for t in terms]
+    expected = [(0.3, 0, 0), (0.25, 0, 0), (0, 0.2, 0), (0, 0.15, 0)]  # and the fan blows on no dust
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert not catalogue("input_exchange").attach(TANKS, SCALES["tanks"], MEASURED["tanks"])

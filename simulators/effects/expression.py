@@ -44,10 +44,11 @@ class Expression:
             states, inputs and measured quantities.
         term: what is added to the rate of a state, or what stands in place of an input or a measured quantity. Roles can
             be used for names: `v` the velocity acted on, `s` its position, `x` the first-order state, `other` another
-            state of the same unit, `u` the input, `y` the measured quantity, `rate` the model's own rate. For `planar` a
-            mapping {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the accelerations along, across and
-            about the vehicle, and to the rate of a heading without inertia, each where the model has it; names are `long`,
-            `lat`, `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in these axes.
+            state of the same unit, `around` an input of the same unit, `u` the input, `y` the measured quantity, `rate` the
+            model's own rate. For `planar` a mapping {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the
+            accelerations along, across and about the vehicle, and to the rate of a heading without inertia, each where the
+            model has it; names are `long`, `lat`, `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in
+            these axes.
         operator: in place of `term`: delay, lag, backlash, sensor_delay or sensor_lag, on the signal that it acts on, with
             one parameter.
         kind: rate, input or sensor, where `acts_on` names quantities; found from the model if left out.
@@ -55,6 +56,7 @@ class Expression:
             (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
             A, V of the vehicle's speed, W, Q of its yaw rate (largest magnitude, typical rate).
         same_as: effects that no data can tell from this one.
+        units: of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
     """
@@ -66,6 +68,7 @@ class Expression:
     operator: str = ""
     kind: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
     same_as: tuple[str, ...] = ()
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
@@ -134,6 +137,8 @@ class Expression:
                     f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
                 )
             for name in members.get(place, (place,)):
+                if self.units and units[name] not in self.units:
+                    continue
                 terms += self._at(name, self.term, model, scales, roles.velocity.get(name), units, place)
         return terms
 
@@ -155,7 +160,9 @@ class Expression:
         ):
             return []
         periodic = {q.name for q in model.states if q.periodic}
-        others = [n for n in states if n != name and units[n] == units[name]] if "other" in names else [""]
+        role = next((r for r in ("other", "around") if r in names), "")
+        among = {"other": states, "around": [q.name for q in model.inputs]}.get(role, [])
+        others = [n for n in among if n != name and units[n] == units[name]] if role else [""]
         own = {"v": name, "x": name, "u": name, "y": name} | ({"s": position} if position else {})
         size = scales.size
         values = {
@@ -171,7 +178,7 @@ class Expression:
         found = []
         for other in others:
             knobs = self._knobs(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
-            swap = own | {"other": other} | {k.label: k.name for k in knobs}
+            swap = own | {role: other} | {k.label: k.name for k in knobs}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
             found.append(self._term(name, kind, text, knobs))
         return found

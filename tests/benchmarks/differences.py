@@ -43,7 +43,11 @@ DIFFERENCES = {
     "racecar": Difference(
         ("discovery.rows=500", "discovery.horizon=15"), "slip of the tyres", ("tyre_slip on vx, vy, omega",)
     ),
-    "greenhouse": Difference(("discovery.rows=400",), "heating pipe (T_p, T_g), humidity and latent heat (V, T_g)"),
+    "greenhouse": Difference(
+        ("discovery.rows=400",),
+        "heating pipe (T_p with T_h and T_g), humidity (V with V_o; transpiration, condensation), latent heat (T_g)",
+        ("input_exchange on T_p", "thermal_coupling on T_p", "input_exchange on V"),
+    ),
     "sergio": Difference(
         ("discovery.rows=300",), "regulation of genes by each other, quadratic Hill function", both=("sim.genes=3",)
     ),
