@@ -77,6 +77,7 @@ def test_claims_of_panel_a(system: str) -> None:
                 ("simpel_only_sim", alone),
                 ("fsvgd", simpel + other),
                 ("gp", 0.0),
+                ("pathwise", simpel + other + 0.5),
             ):
                 found[system, method, n] = Cell(np.array([[value, value + 0.01], [value, value + 0.01]]))
         return found
@@ -85,6 +86,9 @@ def test_claims_of_panel_a(system: str) -> None:
     assert words[:3] == ["* holds", "* DOES NOT HOLD", "* DOES NOT HOLD" if system == "pendulum" else "* holds"]
     words = [line.split(":")[0] for line in panel_a.claims(one(-5.0, -3.0), [system])]
     assert words[2] == ("* holds" if system == "pendulum" else "* DOES NOT HOLD")
+    # half a nat behind FSVGD everywhere
+    assert words[3:5] == ["* DOES NOT HOLD", "* DOES NOT HOLD"]
+    assert [w.split(",")[1].split()[0] for w in words[5:]] == ["simpel", "pathwise"]  # against the exact GP
     partly = {
         key: cell for key, cell in one(-5.0, -5.0).items() if key[1] not in ("simpel_only_sim", "gp") and key[2] != 160
     }

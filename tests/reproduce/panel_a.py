@@ -72,9 +72,10 @@ class System(NamedTuple):
 # the greenhouse.
 POINTS = ("pool=1024", "sets=128")
 NEWTON = ("precondition=true", "fresh_points=32")
-WHERE = {"simpel": "method.", "simpel_only_sim": "method.", "fsvgd": "method.", "greybox": "method.residual."}
+FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")
+WHERE = dict.fromkeys(FSVGD, "method.") | {"greybox": "method.residual."}
 STARTS = {"sysid": "method.starts=2", "gp": "method.sysid.starts=2", "greybox": "method.sysid.starts=2"}
-DRAWS = {"simpel": 256, "simpel_only_sim": 256, "pathwise": 512}
+DRAWS = dict.fromkeys(FSVGD[:3], 256) | {"pathwise": 512}
 CAR = {"x": 1.110899654e-3, "y": 1.110899654e-3, "theta": 1.831563889e-3, "vx": 8.208499862e-3, "vy": 8.208499862e-3,
        "omega": 3.678794412e-2}  # fmt: skip
 SYSTEMS = {
@@ -114,7 +115,7 @@ def listed(values: dict[str, object]) -> str:
     return "{" + ",".join(f"{k}:{list(v) if isinstance(v, tuple) else v}" for k, v in values.items()) + "}"
 
 
-def specifics(method: str, *, wide: bool) -> tuple[str, ...]:
+def specifics(method: str, *, wide: bool = False) -> tuple[str, ...]:
     """Return the words that a method has beside the shared ones."""
     points = (*POINTS, *(NEWTON if wide else ())) if method in WHERE else ()
     words = [f"{WHERE[method]}{point}" for point in points]

@@ -4,7 +4,7 @@
 
 Runs train_1 and train_2 are trained on (rows at random, by data seed), all rows of test_1 are tested on: no neighbour of a
 test row is trained on. Seven past commands go into every network. Low fidelity: a kinematic bicycle without delay. High
-fidelity: Pacejka tyres and commands that act late.
+fidelity: Pacejka tyres and commands that act late. Beside the paper: `gp` and `pathwise`, as in panel (a).
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from tests.reproduce.panel import (
     sizes_of,
     verdict,
 )  # fmt: skip
-from tests.reproduce.panel_a import SPREAD
+from tests.reproduce.panel_a import SPREAD, specifics
 from tests.reproduce.static import folder
 
 SYSTEM = "rc_car"
@@ -42,6 +42,8 @@ METHODS = {  # name -> (method of simpel, simulator)
     "sysid": ("sysid", LOW),
     "sysid, high fidelity": ("sysid", HIGH),
     "gp": ("gp", LOW),
+    "pathwise": ("pathwise", LOW),
+    "pathwise, high fidelity": ("pathwise", HIGH),
 }
 SIZES = (50, 100, 200, 400, 800, 1600, 3200, 6400)
 SMALL = (50, 400, 3200)
@@ -61,7 +63,7 @@ def fits(methods: list[str], data_seeds: int, model_seeds: int, small: bool, sha
             for data_seed in range(data_seeds):
                 words = [
                     "experiment=rc_car", f"sim={sim}", f"method={method}", f"data.n_train={n}", f"data.seed={data_seed}",
-                    "run.name=rc_car", f"run.seeds={model_seeds}", *([f"{key}={steps}"] if key else []),
+                    "run.name=rc_car", f"run.seeds={model_seeds}", *([f"{key}={steps}"] if key else []), *specifics(method),
                 ]  # fmt: skip
                 place = name.replace(", ", "_").replace(" ", "_")
                 every.append(Fit(SYSTEM, place, n, data_seed, tuple(words)))
