@@ -18,7 +18,7 @@ from simpel_cli.methods.fmap import FunctionMAP
 from simpel_cli.methods.fsvgd import FSVGD, stein_velocity
 from simpel_cli.methods.greybox import GreyBox
 from simpel_cli.methods.pathwise import Pathwise
-from simpel_cli.methods.preconditioner import preconditioned
+from simpel_cli.methods.preconditioner import basis, preconditioned
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
@@ -181,7 +181,8 @@ def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly(weight: f
     factor = random.normal(size=(2, 6, 6))
     prior, evenly = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6), np.array([0.3, 2.0])
     velocity = random.normal(size=(3, 6, 2))
-    found = preconditioned(*(jnp.asarray(a) for a in (velocity, prior, evenly)), weight)
+    own = basis(jnp.asarray(prior), jnp.dtype(jnp.float64))
+    found = preconditioned(jnp.asarray(velocity), own, jnp.asarray(evenly), weight)
     for i in range(2):
         curvature = weight * np.linalg.inv(prior[i]) + np.eye(6) / evenly[i]
         np.testing.assert_allclose(found[:, :, i], np.linalg.solve(curvature, velocity[:, :, i].T).T, rtol=1e-9)
@@ -410,10 +411,9 @@ def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of
         whitened = np.asarray(precision[i, 0]) @ law
         assert np.trace(whitened) / 8 == pytest.approx(1.0, abs=0.25)
         if precondition:
-            np.testing.assert_allclose(
-                np.asarray(drawn.covariance[i, 0]) @ np.asarray(precision[i, 0]), np.eye(8), atol=1e-5
-            )
-    assert precondition or drawn.covariance is None
+            values, vectors = (np.asarray(a[i, 0]) for a in drawn.basis)
+            np.testing.assert_allclose(vectors * values @ vectors.T @ np.asarray(precision[i, 0]), np.eye(8), atol=1e-5)
+    assert precondition or drawn.basis is None
     step = jax.jit(lambda key: rule.step(key, state, drawn)[1].loss)
     losses = [float(step(key)) for key in jax.random.split(jax.random.key(2), 60)]
     assert len(set(losses)) == sets

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.networks import Networks, State
-from simpel_cli.methods.preconditioner import preconditioned
+from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
 from simpel_cli.nets import MLP
 from simpel_cli.scores.estimator import Score, fitted
 from simpel_cli.scores.gaussian import moments
@@ -42,14 +42,14 @@ class Sets(NamedTuple):
         batch: training rows of the batch.
         is_data: which of them count.
         score: of the prior, fitted per output; leaves (S, dy, ...).
-        covariance: of the prior, float64; None where it is not needed.
+        basis: of the prior's covariance; None where it is not needed.
     """
 
     x: Float[Array, "*S k dx"]
     batch: Int[Array, "*S b"]
     is_data: Bool[Array, "*S b"]
     score: Score
-    covariance: Float[Array, "*S dy k k"] | None
+    basis: Basis | None
 
 
 @dataclass(frozen=True)
@@ -161,13 +161,13 @@ class FunctionSpace(ABC):
 
         def of_prior(
             key: PRNGKeyArray, x: Float[Array, "k dx"], samples: Float[Array, "k dy N"]
-        ) -> tuple[Score, Float[Array, "dy k k"] | None]:
-            """Score and covariance of the prior on a set, per output."""
+        ) -> tuple[Score, Basis | None]:
+            """Score of the prior on a set, and the basis of its covariance, per output."""
             covariance = setting.prior.covariance(x, problem.gap_scale)
             whole = None
             if self.precondition:
                 drawn = jnp.transpose(samples, (1, 2, 0))
-                whole = jax.vmap(lambda s: moments(s)[1])(drawn) + covariance.astype(jnp.float64)
+                whole = basis(jax.vmap(lambda s: moments(s)[1])(drawn) + covariance.astype(jnp.float64), dtype)
             gap = None
             if setting.score.gap_draws:
                 # a prior without a simulator brings two draws, both zero: enough for moments, not for an estimate
@@ -179,7 +179,7 @@ class FunctionSpace(ABC):
 
         def step(key: PRNGKeyArray, state: State, sets: Sets) -> tuple[State, Info]:
             chosen = jax.random.randint(key, (), 0, count)
-            x, batch, is_data, scores, covariance = jax.tree.map(lambda a: a[chosen], sets)
+            x, batch, is_data, scores, prior_basis = jax.tree.map(lambda a: a[chosen], sets)
             b, counted = batch.shape[0], is_data.astype(dtype)
             y = problem.y[batch]
             h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
@@ -191,9 +191,9 @@ class FunctionSpace(ABC):
             prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(scores, h)
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
-            if covariance is not None:
+            if prior_basis is not None:
                 evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
-                velocity = preconditioned(velocity, covariance, evenly, self.prior_weight)
+                velocity = preconditioned(velocity, prior_basis, evenly, self.prior_weight)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)

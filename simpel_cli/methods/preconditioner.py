@@ -1,6 +1,6 @@
 """Newton's direction in function space, with the data spread evenly over the measurement set.
 
-    P = (w C^-1 + I/c)^-1 = c C/w (C/w + c I)^-1,    c = sigma^2 k / m
+    P = (w C^-1 + I/c)^-1 = V diag(c l/(l + w c)) V',    C = V diag(l) V',    c = sigma^2 k / m
 
 C is the prior's covariance of an output at k measurement points, w the prior's exponent, 1 for Bayes, and m measurements of
 noise sigma tell as much as k with sigma^2 k/m. The curvature of the log posterior spans the ratio of the prior's largest
@@ -12,30 +12,36 @@ Reference: Amari (1998), Natural gradient works efficiently in learning; Wang, T
 gradient descent with matrix-valued kernels, section 3.2.
 """
 
-import jax
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+class Basis(NamedTuple):
+    """Eigenvalues and eigenvectors of the prior's covariance of every output: taken once for a set of points."""
+
+    values: Float[Array, "*S dy k"]
+    vectors: Float[Array, "*S dy k k"]
+
+
+def basis(covariance: Float[Array, "dy k k"], dtype: jnp.dtype) -> Basis:
+    """Return the eigenbasis of covariances, taken in float64; no direction is amplified, so that `dtype` may be less."""
+    values, vectors = jnp.linalg.eigh(covariance.astype(jnp.float64))
+    return Basis(jnp.maximum(values, 0.0).astype(dtype), vectors.astype(dtype))
+
+
 def preconditioned(
-    velocity: Float[Array, "L k dy"],
-    covariance: Float[Array, "dy k k"],
-    evenly: Float[Array, " dy"],
-    weight: float = 1.0,
+    velocity: Float[Array, "L k dy"], prior: Basis, evenly: Float[Array, " dy"], weight: float = 1.0
 ) -> Float[Array, "L k dy"]:
     """Return P times a velocity of function values, per output.
 
     Args:
         velocity: of L particles.
-        covariance: C of every output, float64.
+        prior: of C.
         evenly: c, variance of the data as if there were one at every point.
         weight: w, positive.
     """
-
-    def of_output(v: Float[Array, "L k"], prior: Float[Array, "k k"], c: Float[Array, ""]) -> Float[Array, "L k"]:
-        prior, c = prior / weight, c.astype(prior.dtype)
-        factor = jnp.linalg.cholesky(prior + c * jnp.eye(prior.shape[0]))
-        solved = jax.scipy.linalg.cho_solve((factor, True), v.T.astype(prior.dtype))
-        return (c * (prior @ solved)).T.astype(v.dtype)
-
-    return jax.vmap(of_output, in_axes=(2, 0, 0), out_axes=2)(velocity, covariance, evenly)
+    share = evenly[:, None] * prior.values / (prior.values + weight * evenly[:, None])
+    turned = jnp.einsum("dkj,lkd->dlj", prior.vectors, velocity) * share[:, None]
+    return jnp.einsum("dkj,dlj->lkd", prior.vectors, turned)
