@@ -95,6 +95,8 @@ def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
     todo = [fit for fit in fits if not _done(fit, out)]
     print(f"{len(fits)} fits, {len(fits) - len(todo)} are there, {len(todo)} to run", flush=True)
     began = time.perf_counter()
+    # a worker has one core: threads of LAPACK, started before it is held to that, wait for each other on it (10 times slower)
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
     cores = context.Queue()
     for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0))), processes):
