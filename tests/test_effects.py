@@ -388,3 +388,14 @@ def test_exchange_with_what_an_input_tells_is_between_temperatures_or_concentrat
     expected = [(0.3, 0, 0), (0.25, 0, 0), (0, 0.2, 0), (0, 0.15, 0)]  # and the fan blows on no dust
     np.testing.assert_allclose(found, expected, atol=1e-12)
     assert not catalogue("input_exchange").attach(TANKS, SCALES["tanks"], MEASURED["tanks"])
+
+
+def test_units_are_one_or_several_and_go_with_no_planar_term() -> None:
+    one = Expression("e", "", "first_order", "-k*x", units="degC", parameters={"k": {"range": [0, 1]}})
+    assert [t.acts_on for t in one.attach(ROOM, SCALES["room"], MEASURED["room"])] == ["T", "floor"]
+    deg = Expression("e", "", "first_order", "-k*x", units="deg", parameters={"k": {"range": [0, 1]}})
+    assert not deg.attach(ROOM, SCALES["room"], MEASURED["room"])
+    with pytest.raises(ModelError, match=r"effect.e.units: not with `acts_on: planar`"):
+        Expression("e", "", "planar", {"long": "-k"}, units="m/s", parameters={"k": {"range": [0, 1]}})
+    with pytest.raises(ModelError, match=r"effect.e.term: .* has both `other` and `around`"):
+        Expression("e", "", "first_order", "k*(other - around)", parameters={"k": {"range": [0, 1]}})

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from test_methods import EDGE, FIXED, GRID, NOISE, X, predicted, prior_of, problem_of, setting_of
+from test_methods import EDGE, FIXED, GRID, NOISE, PARAMS, X, predicted, prior_of, problem_of, run, setting_of
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.gp import SquaredExponential
-from simpel_cli.inference import Bank, Inference, NoiseModel, Problem, padded_length
+from simpel_cli.inference import Bank, Inference, NoiseModel, Normaliser, Problem, pad_rows, padded_length
 from simpel_cli.likeliest import evenly
 from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.nets import MLP
@@ -55,6 +55,66 @@ def test_paths_have_mean_and_covariance_of_the_posterior(rows: int) -> None:
     prior_std = np.sqrt(np.diag(law(at, at)))
     np.testing.assert_allclose(h.mean(axis=0), mean, atol=0.02 * prior_std.max())
     np.testing.assert_allclose(np.cov(h.T), spread, atol=0.03 * spread.max() + 0.002)
+
+
+def test_paths_of_two_outputs_in_units_of_their_own() -> None:
+    """Normalisers, scales of the gap, a lengthscale and a white model error that are not 1, 0 and nothing."""
+    white, reach, kappas = 0.02, 0.8, np.array([0.5, 0.2])
+    scale = Normaliser(np.array([0.5]), np.array([2.0]), np.array([3.0, -1.0]), np.array([2.0, 0.5]))
+
+    def two(x: jax.Array, phi: jax.Array) -> jax.Array:
+        return jnp.concatenate([phi[:1] * x + phi[1:], phi[1:] * x])
+
+    y = (np.concatenate([1.3 * X - 0.4, 0.3 * X], axis=1) - scale.y_mean) / scale.y_std + 0.2 * np.sin(X)
+    pad = padded_length(len(X))
+    problem = jax.tree.map(jnp.asarray, Problem(
+        pad_rows(X, pad), pad_rows(y, pad), np.array(len(X), np.int32), scale, kappas, np.full(2, NOISE), np.full(2, 1e-3),
+    ))  # fmt: skip
+    prior = FunctionPrior(9000, white, SquaredExponential(), np.full(1, reach), PARAMS, two, 1, 2)
+    rule = MANY.bind(setting_of(prior), problem)
+    state, targets = drawn(rule)
+    at = 0.5 + 2.0 * np.asarray(targets.x)[: 32 + len(X)]  # data units
+    total = np.sqrt(NOISE**2 + white)
+    np.testing.assert_allclose(rule.predict(state, jnp.asarray(X)).noise_std, total * scale.y_std, rtol=1e-6)
+
+    def of(a: np.ndarray, b: np.ndarray, i: int) -> np.ndarray:
+        draws = (3.0 * a @ b.T + 0.25) / 4 if i == 0 else a @ b.T
+        return draws + kappas[i] ** 2 * oracles.squared_exponential(a[:, 0] / 2 * reach, b[:, 0] / 2 * reach, 1.0)
+
+    for i, centre in enumerate((-1.5, 2.0)):
+        mean, spread = oracles.gp_posterior(of(X, X, i), of(at, X, i), of(at, at, i), y[:, i] - centre, total)
+        h = np.asarray(targets.h)[:, : 32 + len(X), i]
+        np.testing.assert_allclose(h.mean(axis=0), mean + centre, atol=0.02)
+        np.testing.assert_allclose(h.std(axis=0), np.sqrt(np.diag(spread)), rtol=0.1, atol=0.003)
+    apart = np.corrcoef(np.asarray(targets.h)[:, 33, 0] - np.asarray(targets.h)[:, 33, 1], np.arange(4000))[0, 1]
+    assert abs(apart) < 0.1  # no trend over the paths
+
+
+def test_gaps_of_two_outputs_are_different_functions() -> None:
+    problem = problem_of(noisy(), KAPPA)
+    both = problem._replace(
+        y=jnp.tile(problem.y, (1, 2)), gap_scale=jnp.full(2, KAPPA), noise_init=jnp.full(2, NOISE),
+        noise_floor=jnp.full(2, 1e-3), normaliser=problem.normaliser._replace(y_mean=jnp.zeros(2), y_std=jnp.ones(2)),
+    )  # fmt: skip
+    prior = FunctionPrior(2, 1e-8, SquaredExponential(), np.ones(1), (), None, 0, 2)
+    _, targets = drawn(MANY.bind(setting_of(prior), both))
+    h = np.asarray(targets.h)
+    middle = int(np.argmax(h[:, :32, 0].std(axis=0)))  # least known
+    assert abs(np.corrcoef(h[:, middle, 0], h[:, middle, 1])[0, 1]) < 0.1
+
+
+def test_networks_look_at_the_data_too_where_the_domain_is_elsewhere() -> None:
+    method = Pathwise(steps=1500, particles=4, network=MLP((32, 32)), pool=32, features=500, noise=FIXED)
+    y = noisy()
+    prior = prior_of(gap=True)._replace(draws=1000)
+    setting = setting_of(prior)._replace(
+        sample_inputs=lambda key, n: jax.random.uniform(key, (n, 1), minval=8.0, maxval=9.0)
+    )
+    rule = method.bind(setting, problem_of(y, KAPPA))
+    found = rule.predict(run(rule, method.steps), jnp.asarray(X)).mean[:, 0]
+    assert np.sqrt(np.mean((np.asarray(found) - exact(X, y)[0]) ** 2)) < 0.15
+    _, targets = drawn(rule)
+    assert float(targets.x[:32].min()) > 7
 
 
 def test_paths_stay_the_same_functions_from_stretch_to_stretch() -> None:
@@ -108,6 +168,16 @@ def test_rows_beyond_those_conditioned_on_and_padding_tell_nothing() -> None:
     assert np.abs(np.asarray(one.h - moved.h)).max() > 0.5
 
 
+@pytest.mark.parametrize("noise", [FIXED, NoiseModel()])
+def test_padding_tells_nothing(noise: NoiseModel) -> None:
+    method, few = Pathwise(particles=6, noise=noise, **FEW), problem_of(noisy()[:5], KAPPA, X[:5])
+    junk = np.arange(len(few.x)) >= 5
+    other = few._replace(x=few.x + 0.7 * junk[:, None], y=few.y + 9.0 * junk[:, None])
+    (state, one), (later, same) = (drawn(rule_of(method, problem, draws=400)) for problem in (few, other))
+    np.testing.assert_allclose(one.h[:, :37], same.h[:, :37], atol=1e-6)
+    np.testing.assert_allclose(state.networks.noise, later.networks.noise, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("padded", "rows", "most"), [(32, 5, 64), (1024, 600, 512), (1024, 600, 1000), (64, 64, 1)])
 def test_rows_are_chosen_evenly_and_once(padded: int, rows: int, most: int) -> None:
     chosen, count = evenly(padded, np.array(rows, np.int32), most)
@@ -154,14 +224,20 @@ def test_what_it_cannot_do_is_refused() -> None:
             return jnp.exp(-squared_distance)
 
     method, problem = Pathwise(particles=10, noise=FIXED, **FEW), problem_of(noisy())
-    with pytest.raises(ConfigError, match=r"prior.draws: got 11; method=pathwise needs method.particles \(10\)"):
-        rule_of(method, problem, draws=11)
-    with pytest.raises(ConfigError, match=r"prior.gap.kernel: Wavy has no `frequencies`"):
+    with pytest.raises(
+        ConfigError, match=r"prior.draws: got 73; method=pathwise needs 74 or more: method.particles \(10\)"
+    ):
+        rule_of(method, problem, draws=73)
+    with pytest.raises(ConfigError, match=r"prior: its kernel Wavy has no `frequencies`"):
         rule_of(method, problem, kernel=Wavy())
     with pytest.raises(ConfigError, match=r"method.pool: got 0; it must be at least 1"):
         Pathwise(pool=0)
     with pytest.raises(ConfigError, match=r"method.learning_rate: got -1.0; it must be positive"):
         Pathwise(learning_rate=-1.0)
+    with pytest.raises(
+        ConfigError, match=r"method.final_learning_rate: got 1.5; it is the fraction that is left at the end: 0 to 1"
+    ):
+        Pathwise(final_learning_rate=1.5)
 
 
 def test_one_path_goes_through_what_is_free_of_noise() -> None:

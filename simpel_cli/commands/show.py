@@ -66,7 +66,9 @@ def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
 def _used(study: Study, fitted: Fitted) -> str:
     """What was trained on; a simulator without states has no step, hence no dt."""
     used, source = len(fitted.training[0][0]), study.system.source
-    return f"{used} transitions used, dt {source.dt:g} s" if source.states else f"{used} rows used"
+    most = getattr(study.method, "most_rows", used)
+    beyond = f" (of which the method takes {most}, evenly: method.most_rows)" if used > most else ""
+    return f"{used} transitions used{beyond}, dt {source.dt:g} s" if source.states else f"{used} rows used{beyond}"
 
 
 def _gap_text(study: Study, fitted: Fitted) -> str:

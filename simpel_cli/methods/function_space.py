@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
-from simpel_cli.methods.networks import Networks, State
+from simpel_cli.methods.networks import Networks, State, refuse_rates
 from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
 from simpel_cli.nets import MLP
 from simpel_cli.scores.estimator import Score, fitted
@@ -102,8 +102,7 @@ class FunctionSpace(ABC):
             )
         if self.precondition and not self.prior_weight > 0:
             raise ConfigError(f"method.precondition: it needs a prior, and method.prior_weight is {self.prior_weight}.")
-        if not self.learning_rate > 0:
-            raise ConfigError(f"method.learning_rate: got {self.learning_rate}; it must be positive.")
+        refuse_rates(self.learning_rate, self.final_learning_rate)
 
     @abstractmethod
     def velocity(

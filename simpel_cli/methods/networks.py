@@ -7,9 +7,24 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.errors import ConfigError
 from simpel_cli.inference import NoiseModel, Problem
 from simpel_cli.nets import MLP, Particles
 from simpel_cli.predictive import Predictive
+
+
+def refuse_rates(learning_rate: float, final: float) -> None:
+    """Refuse what is no learning rate, or no fraction of it that is left at the last step.
+
+    Raises:
+        ConfigError: with what is allowed.
+    """
+    if not learning_rate > 0:
+        raise ConfigError(f"method.learning_rate: got {learning_rate}; it must be positive.")
+    if not 0 <= final <= 1:
+        raise ConfigError(
+            f"method.final_learning_rate: got {final}; it is the fraction that is left at the end: 0 to 1."
+        )
 
 
 class State(NamedTuple):

@@ -3,10 +3,11 @@
     h_l(x) = f_l(x) + c(x, X) (C + (w + sigma^2) I)^-1 (y + e_l - f_l(X)),    e_l ~ N(0, (w + sigma^2) I)
 
 per output, where f_l = g(., phi_l) + h~_l is a draw of the prior and c its covariance: that of draws of the simulator plus the
-gap's kernel. Where the prior is Gaussian h_l is a draw of the posterior, exactly; where it is not, the best update of a draw
-that is linear in the data. Function-space inference under the `gaussian` score converges to that, too, but nothing here is
-stiff: a network regresses on one function, whatever the eigenvalues of C. kappa and sigma are those of the largest marginal
-likelihood.
+gap's kernel. Where the prior is Gaussian h_l is a draw of the posterior, up to the number of draws and of features; where it is
+not, the best update of a draw that is linear in the data. Function-space inference under the `gaussian` score converges to
+that, too, but nothing here is stiff: a network regresses on one function, whatever the eigenvalues of C. sigma is that of the
+largest penalised marginal likelihood, on a grid, of no more than 512 rows; what is reported as noise is the root of
+sigma^2 + w, since the white model error w is no part of a path.
 
 Reference: Wilson et al. (2020), Efficiently sampling functions from Gaussian process posteriors, eqs. 8-13; Matheron's rule in
 Journel and Huijbregts (1978); Rahimi and Recht (2007), Random features for large-scale kernel machines (the gap's paths);
@@ -26,16 +27,19 @@ from simpel_cli.gp import Spectral, gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
 from simpel_cli.likeliest import MOST_ROWS, Spectrum, evenly, likeliest
 from simpel_cli.methods import networks as nets
-from simpel_cli.methods.networks import Networks
+from simpel_cli.methods.networks import Networks, refuse_rates
 from simpel_cli.nets import MLP
 from simpel_cli.prior import FunctionPrior
+
+LEAST_DRAWS = 64  # that a covariance is worth taking of
 
 
 class Paths(NamedTuple):
     """Sample paths of the posterior, float64.
 
     Args:
-        key: data of the key that the prior's draws come from.
+        key: data of the key that the prior's draws come from; with another version of JAX, which may draw others from it, a run
+            cannot be resumed.
         along: coefficients of the simulator's draws, about their mean.
         at: coefficients of the kernel at the rows that are conditioned on.
     """
@@ -77,8 +81,9 @@ class Pathwise:
         batch: points per step, of the domain and of the data.
         pool: points of the domain that a stretch of steps chooses from.
         features: of a path of the gap.
-        most_rows: training rows that are conditioned on, at most, evenly chosen; time grows as their third power.
-        noise: observation noise; learned: that of the largest marginal likelihood.
+        most_rows: training rows that are conditioned on, at most, evenly chosen; the others are not looked at. Time grows as
+            their third power.
+        noise: observation noise; learned: that of the largest marginal likelihood, so that `rate` plays no part.
     """
 
     steps: int = 5000
@@ -98,8 +103,7 @@ class Pathwise:
         for name in ("steps", "particles", "batch", "pool", "features", "most_rows"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
-        if not self.learning_rate > 0:
-            raise ConfigError(f"method.learning_rate: got {self.learning_rate}; it must be positive.")
+        refuse_rates(self.learning_rate, self.final_learning_rate)
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`).
@@ -107,7 +111,7 @@ class Pathwise:
         Raises:
             ConfigError: the prior has too few draws, or a kernel whose paths cannot be drawn.
         """
-        prior = self._prior_of(setting)
+        prior = self._prior_of(setting, brings_draws=problem.bank is not None)
         scale, dtype = problem.normaliser, problem.x.dtype
         n_rows, dim_y = problem.y.shape
         kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
@@ -119,9 +123,7 @@ class Pathwise:
         counts = (jnp.arange(len(rows), dtype=jnp.int32) < count).astype(jnp.float64)
         known = scale.x(jnp.asarray(problem.x)[rows])
 
-        def simulated(
-            key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: slice | Int[Array, " n"]
-        ) -> Float[Array, "n dy N"]:
+        def simulated(key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: Int[Array, " n"]) -> Float[Array, "n dy N"]:
             """Draws at inputs in data units, which are these rows of a bank, normalised; those of the paths first."""
             if problem.bank is not None:
                 draws = jnp.asarray(problem.bank.samples)[at]
@@ -226,7 +228,7 @@ class Pathwise:
             x, draws = scale.x(points), simulated(key_draws, points, at)
             before = prior_paths(key_gap, x, draws)
             moved = jnp.einsum("dnj,djl->ndl", centred(draws), paths.along)
-            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(x, known) * counts[None], paths.at)
+            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(x, known), paths.at)
             return Targets(x, jnp.moveaxis(before + moved, -1, 0).astype(dtype))
 
         def step(key: PRNGKeyArray, state: State, targets: Targets) -> tuple[State, Info]:
@@ -244,23 +246,26 @@ class Pathwise:
             lambda state, x: networks.predict(state.networks, x), lambda state, x: networks.members(state.networks, x),
         )  # fmt: skip
 
-    def _prior_of(self, setting: Setting) -> FunctionPrior:
+    def _prior_of(self, setting: Setting, *, brings_draws: bool) -> FunctionPrior:
         prior = setting.prior
         if not isinstance(prior, FunctionPrior):
-            raise ConfigError("method: pathwise needs prior=simulator, simulator_only or gp.")
-        if (prior.simulates or prior.draws > 2) and prior.draws < self.particles + 2:
             raise ConfigError(
-                f"prior.draws: got {prior.draws}; method=pathwise needs method.particles ({self.particles}) for its paths and "
-                "at least 2 more for their covariance."
+                f"prior: got a {type(prior).__name__}; method=pathwise needs prior=simulator, simulator_only or gp."
+            )
+        least = self.particles + LEAST_DRAWS
+        if (prior.simulates or brings_draws) and prior.draws < least:
+            raise ConfigError(
+                f"prior.draws: got {prior.draws}; method=pathwise needs {least} or more: method.particles "
+                f"({self.particles}) for its paths, and {LEAST_DRAWS} for their covariance."
             )
         if prior.kernel is not None and not isinstance(prior.kernel, Spectral):
             raise ConfigError(
-                f"prior.gap.kernel: {type(prior.kernel).__name__} has no `frequencies`, which paths are drawn from; give it "
+                f"prior: its kernel {type(prior.kernel).__name__} has no `frequencies`, which paths are drawn from; give it "
                 "that method (see simpel_cli/gp.py), or use SquaredExponential, Matern32 or Matern52."
             )
         return prior
 
     def _paired(self, key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "L *shape"]:
-        """Standard normal numbers for every path, in pairs of opposite sign: their mean is that of the posterior."""
+        """Standard normal numbers for every path, in pairs of opposite sign, which cancel in the mean of the paths."""
         half = jax.random.normal(key, (-(-self.particles // 2), *shape), jnp.float64)
         return jnp.concatenate([half, -half])[: self.particles]

@@ -14,7 +14,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.fsvgd import refuse_bandwidth, stein_velocity
 from simpel_cli.methods.function_space import distinct_rows, log_likelihood
-from simpel_cli.methods.networks import Networks, State
+from simpel_cli.methods.networks import Networks, State, refuse_rates
 from simpel_cli.nets import MLP, Particles
 
 
@@ -56,7 +56,8 @@ class SVGD:
         for name in ("steps", "particles", "batch"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
-        for name in ("learning_rate", "weight_std", "bias_std"):
+        refuse_rates(self.learning_rate, self.final_learning_rate)
+        for name in ("weight_std", "bias_std"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be positive.")
 

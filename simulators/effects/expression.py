@@ -56,7 +56,7 @@ class Expression:
             (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
             A, V of the vehicle's speed, W, Q of its yaw rate (largest magnitude, typical rate).
         same_as: effects that no data can tell from this one.
-        units: of the quantities that it can act on; empty: any.
+        units: unit or units of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
     """
@@ -68,7 +68,7 @@ class Expression:
     operator: str = ""
     kind: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    units: tuple[str, ...] = ()
+    units: str | tuple[str, ...] = ()
     same_as: tuple[str, ...] = ()
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
@@ -89,6 +89,12 @@ class Expression:
             raise ModelError(
                 f"{where}.term: a term per part goes with `acts_on: {PLANAR}` alone; write {{long: ...}}; parts: "
                 f"{', '.join(PARTS)}"
+            )
+        if self.units and parts:
+            raise ModelError(f"{where}.units: not with `acts_on: {PLANAR}`, whose parts are accelerations and a rate")
+        if isinstance(self.term, str) and self.term and {"other", "around"} <= _names(self.term):
+            raise ModelError(
+                f"{where}.term: {self.term!r} has both `other` and `around`; one effect is an exchange with one"
             )
         for name, node in self.parameters.items():
             if not (
@@ -137,7 +143,7 @@ class Expression:
                     f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
                 )
             for name in members.get(place, (place,)):
-                if self.units and units[name] not in self.units:
+                if self.units and units[name] not in ((self.units,) if isinstance(self.units, str) else self.units):
                     continue
                 terms += self._at(name, self.term, model, scales, roles.velocity.get(name), units, place)
         return terms

@@ -174,7 +174,7 @@ def judged(rows: list[dict[str, Any]], scale: dict[str, float]) -> list[tuple[in
     found = [(r["seed"], "nll", r["value"]) for r in rows if (r["metric"], r["output"]) == ("nll", "joint")]
     for seed in sorted({r["seed"] for r in rows}):
         alone = [r["value"] for r in rows if r["metric"] == "nll" and r["seed"] == seed and r["output"] != "joint"]
-        found.append((seed, "nll_sum", float(np.sum(alone))))
+        found.append((seed, "nll_sum", float(np.sum(alone)) if alone else float("nan")))
         own = {r["output"]: r["value"] for r in rows if r["metric"] == "rmse" and r["seed"] == seed}
         found.append((seed, "nrmse", float(np.sqrt(np.mean([(own[name] / s) ** 2 for name, s in scale.items()])))))
     return found

@@ -6,7 +6,7 @@ Truth: one draw of the high-fidelity parameters per data seed, states and inputs
 follows, 1000 test rows. Prior: the low-fidelity simulator. The same data, normalisation, noise model and number of steps for
 every method that learns a network; those with a prior over functions get POINTS of the box, on sergio Newton's direction, too
 (WIDE). Beside the paper: the exact GP about the identified simulator (`gp`), and SimPEL's prior, conditioned in closed form
-(`pathwise`).
+(`pathwise`, of no more than method.most_rows training rows: 2048).
 """
 
 from pathlib import Path
@@ -68,8 +68,8 @@ class System(NamedTuple):
     wide: bool = False
 
 
-# More points of the box than the defaults have, from fewer draws, at the same cost: worth 0.1 nats on the race car, 1 to 4 in
-# the greenhouse.
+# More points of the box than the defaults have, and fewer draws, for every prior over functions: SimPEL gains 0.1 nats on the
+# race car by it and 0.5 to 4 in the greenhouse (docs/paper.md).
 POINTS = ("pool=1024", "sets=128")
 NEWTON = ("precondition=true", "fresh_points=32")
 FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")

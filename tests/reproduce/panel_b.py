@@ -4,7 +4,8 @@
 
 Runs train_1 and train_2 are trained on (rows at random, by data seed), all rows of test_1 are tested on: no neighbour of a
 test row is trained on. Seven past commands go into every network. Low fidelity: a kinematic bicycle without delay. High
-fidelity: Pacejka tyres and commands that act late. Beside the paper: `gp` and `pathwise`, as in panel (a).
+fidelity: Pacejka tyres and commands that act late. Beside the paper: `gp` and `pathwise`; points of the
+box and draws as in panel (a).
 """
 
 import numpy as np
