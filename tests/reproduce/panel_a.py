@@ -69,7 +69,7 @@ class System(NamedTuple):
 
 
 # More points of the box than the defaults have, and fewer draws, for every prior over functions: SimPEL gains 0.1 nats on the
-# race car by it and 0.5 to 4 in the greenhouse (docs/paper.md).
+# race car by it and 0.5 to 1.5 in the greenhouse (docs/paper.md).
 POINTS = ("pool=1024", "sets=128")
 NEWTON = ("precondition=true", "fresh_points=32")
 FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")
