@@ -435,7 +435,7 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
     def two(x: jax.Array, phi: jax.Array) -> jax.Array:
         return jnp.concatenate([phi[:1] * x + 20.0, phi[1:] * x - 300.0])
 
-    prior = FunctionPrior(16, 1e-4, GPPrior().kernel, np.ones(1), PARAMS, two, 1, 2)
+    prior = FunctionPrior(70, 1e-4, GPPrior().kernel, np.ones(1), PARAMS, two, 1, 2)
     x = np.repeat(X[None], seeds, axis=0)
     y = np.concatenate([1.3 * X, 0.5 * X], axis=1)[None] + np.zeros((seeds, 1, 1))
     pad = padded_length(N)
@@ -486,6 +486,7 @@ def test_many_data_get_more_sets_than_few() -> None:
         x = np.linspace(-EDGE, EDGE, rows)[:, None]
         method = FSVGD(particles=2, network=MLP((4,)), batch=4, fresh_points=4, pool=16, sets=3)
         rule = method.bind(setting_of(prior_of()), problem_of(x, x=x))
-        return len(jax.eval_shape(rule.draw, jax.random.key(0)).x)
+        key = jax.random.key(0)
+        return len(jax.eval_shape(lambda: rule.draw(key, rule.init(key))).x)
 
     assert [count(n) for n in (8, 60, 5000)] == [8, 16, 256]  # rows are padded to 32, 64, 8192
