@@ -46,3 +46,14 @@ def did_you_mean(word: str, allowed: list[str]) -> str:
 
     close = get_close_matches(word, allowed, n=1, cutoff=0.6)
     return f" Did you mean {close[0]}?" if close else ""
+
+
+def check_at_least_one(group: str, settings: object, names: tuple[str, ...]) -> None:
+    """Refuse fields of a configuration group that are below 1.
+
+    Raises:
+        ConfigError: with the key, what was given and what is allowed.
+    """
+    for name in names:
+        if getattr(settings, name) < 1:
+            raise ConfigError(f"{group}.{name}: got {getattr(settings, name)}; it must be at least 1.")

@@ -13,6 +13,7 @@ from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.console import Terminal
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
+from simpel_cli.inference import Method
 from simpel_cli.plots import draw_run
 from simpel_cli.prior_predictive import PriorCheck
 from simpel_cli.report import figure, write_report
@@ -41,7 +42,8 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
         f"simpel fit · {s.name} · {named_method(study)} · {seeds} · {study.device.platform} {s.precision}",
         style="bold",
     )
-    describe_data(terminal, recording, f"{extent_of_split(recording)}, {_used(study, fitted)}")
+    rows = len(fitted.training[0][0])
+    describe_data(terminal, recording, f"{extent_of_split(recording)}, {used(study.method, source, rows)}")
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (queried)"
     terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
@@ -63,12 +65,11 @@ def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
         terminal.line(f"not measured, estimated from the position: {', '.join(recording.estimated)}", "")
 
 
-def _used(study: Study, fitted: Fitted) -> str:
+def used(method: Method, source: Any, rows: int) -> str:
     """What was trained on; a simulator without states has no step, hence no dt."""
-    used, source = len(fitted.training[0][0]), study.system.source
-    most = getattr(study.method, "most_rows", used)
-    beyond = f" (of which the method takes {most}, evenly: method.most_rows)" if used > most else ""
-    return f"{used} transitions used{beyond}, dt {source.dt:g} s" if source.states else f"{used} rows used{beyond}"
+    most = getattr(method, "most_rows", rows)
+    beyond = f" (of which the method takes {most}, evenly: method.most_rows)" if rows > most else ""
+    return f"{rows} transitions used{beyond}, dt {source.dt:g} s" if source.states else f"{rows} rows used{beyond}"
 
 
 def _gap_text(study: Study, fitted: Fitted) -> str:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from simpel_cli.discovery.selection import BEGINNINGS
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 
 PAIR = 11  # unknowns of a function of two arguments beside an effect
 
@@ -36,9 +36,7 @@ class Discovery:
             raise ConfigError(
                 f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
             )
-        for name in ("horizon", "lanes", "room", "rows"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"discovery.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("discovery", self, ("horizon", "lanes", "room", "rows"))
         if self.beginnings < 0:
             raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")
         if self.substeps is not None and self.substeps < 1:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.networks import Networks, State, refuse_rates
 from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
@@ -92,9 +92,7 @@ class FunctionSpace(ABC):
     uses_score = True  # not a field
 
     def __post_init__(self) -> None:
-        for name in ("steps", "particles", "batch", "fresh_points", "pool", "sets"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("method", self, ("steps", "particles", "batch", "fresh_points", "pool", "sets"))
         points = self.batch + self.fresh_points  # fresh ones fill the batch where data are fewer
         if self.pool & (self.pool - 1) or self.pool < points:
             raise ConfigError(

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.gp import Spectral, gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
 from simpel_cli.likeliest import MOST_ROWS, Spectrum, evenly, likeliest
@@ -42,11 +42,13 @@ class Paths(NamedTuple):
             cannot be resumed.
         along: coefficients of the simulator's draws, about their mean.
         at: coefficients of the kernel at the rows that are conditioned on.
+        known: values at these rows: y + e - (w + sigma^2) (C + (w + sigma^2) I)^-1 (y + e - f(X)), normalised.
     """
 
     key: Int[Array, " words"]
     along: Float[Array, "dy N L"]
     at: Float[Array, "dy c L"]
+    known: Float[Array, "dy c L"]
 
 
 class State(NamedTuple):
@@ -100,9 +102,7 @@ class Pathwise:
     uses_score = False  # not a field: the law of Gaussian values is known
 
     def __post_init__(self) -> None:
-        for name in ("steps", "particles", "batch", "pool", "features", "most_rows"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("method", self, ("steps", "particles", "batch", "pool", "features", "most_rows"))
         refuse_rates(self.learning_rate, self.final_learning_rate)
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
@@ -198,38 +198,43 @@ class Pathwise:
             variance = sigma**2 + prior.white_variance
             measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
             noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None, None]
-            left = (measured[:, :, None] + jnp.moveaxis(noise, 0, -1) - before) * counts[:, None, None]
+            seen = measured[:, :, None] + jnp.moveaxis(noise, 0, -1)
+            left = (seen - before) * counts[:, None, None]
             correlation = correlations(known, known)
 
             def of_output(
-                given: tuple[Float[Array, "c N"], Float[Array, "c L"], Float[Array, ""], Float[Array, ""]],
-            ) -> tuple[Float[Array, "N L"], Float[Array, "c L"]]:
-                own, left, kappa, variance = given
+                given: tuple[
+                    Float[Array, "c N"], Float[Array, "c L"], Float[Array, "c L"], Float[Array, ""], Float[Array, ""]
+                ],
+            ) -> tuple[Float[Array, "N L"], Float[Array, "c L"], Float[Array, "c L"]]:
+                own, seen, left, kappa, variance = given
                 own = own * counts[:, None]
                 law = own @ own.T + kappa**2 * correlation * counts[:, None] * counts[None]
                 factor = jnp.linalg.cholesky(law + variance * jnp.eye(len(law)))
                 solved = jax.scipy.linalg.cho_solve((factor, True), left)
-                return own.T @ solved, kappa**2 * solved
+                return own.T @ solved, kappa**2 * solved, seen - variance * solved
 
-            along, at = jax.lax.map(of_output, (own, jnp.moveaxis(left, 1, 0), kappa, variance))
+            seen, left = jnp.moveaxis(seen, 1, 0), jnp.moveaxis(left, 1, 0)
+            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance))
             total = jnp.sqrt(variance).astype(dtype)
             rho = self.noise.init(total, problem.noise_floor)
             first = networks.init(key_networks)._replace(noise=rho)
-            return State(Paths(jax.random.key_data(key_paths), along, at), first)
+            return State(Paths(jax.random.key_data(key_paths), along, at, values), first)
 
         def draw(key: PRNGKeyArray, state: State) -> Targets:
             paths = state.paths
             key_draws, key_gap = jax.random.split(jax.random.wrap_key_data(paths.key))
-            fresh = (
-                setting.sample_inputs(key, self.pool) if problem.bank is None else jnp.asarray(problem.bank.x)[n_rows:]
-            )
-            at = jnp.concatenate([n_rows + jnp.arange(len(fresh), dtype=rows.dtype), rows])
-            points = jnp.concatenate([fresh, jnp.asarray(problem.x)[rows]])
-            x, draws = scale.x(points), simulated(key_draws, points, at)
-            before = prior_paths(key_gap, x, draws)
+            if problem.bank is None:
+                points = setting.sample_inputs(key, self.pool)
+            else:
+                points = jnp.asarray(problem.bank.x)[n_rows:]
+            draws = simulated(key_draws, points, n_rows + jnp.arange(len(points), dtype=rows.dtype))
+            fresh = scale.x(points)
             moved = jnp.einsum("dnj,djl->ndl", centred(draws), paths.along)
-            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(x, known), paths.at)
-            return Targets(x, jnp.moveaxis(before + moved, -1, 0).astype(dtype))
+            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(fresh, known), paths.at)
+            elsewhere = prior_paths(key_gap, fresh, draws) + moved
+            h = jnp.concatenate([elsewhere, jnp.moveaxis(paths.known, 0, 1)])
+            return Targets(jnp.concatenate([fresh, known]), jnp.moveaxis(h, -1, 0).astype(dtype))
 
         def step(key: PRNGKeyArray, state: State, targets: Targets) -> tuple[State, Info]:
             fresh = len(targets.x) - len(rows)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.fsvgd import refuse_bandwidth, stein_velocity
 from simpel_cli.methods.function_space import distinct_rows, log_likelihood
@@ -53,9 +53,7 @@ class SVGD:
 
     def __post_init__(self) -> None:
         refuse_bandwidth(self.bandwidth)
-        for name in ("steps", "particles", "batch"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("method", self, ("steps", "particles", "batch"))
         refuse_rates(self.learning_rate, self.final_learning_rate)
         for name in ("weight_std", "bias_std"):
             if not getattr(self, name) > 0:

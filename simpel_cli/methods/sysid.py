@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.predictive import Predictive
 from simpel_cli.prior import WIDE, FunctionPrior
@@ -60,9 +60,7 @@ class SysID:
     uses_score = False  # nor is the prior over functions, but for its parameters
 
     def __post_init__(self) -> None:
-        for name in ("steps", "starts", "particles"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("method", self, ("steps", "starts", "particles"))
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
         """Return the rule for this problem (see `simpel_cli.inference.Inference`).

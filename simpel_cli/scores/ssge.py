@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.errors import ConfigError
+from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.scores import radial
 from simpel_cli.scores.estimator import Estimator, Score
 from simpel_cli.scores.gaussian import Gaussian
@@ -49,9 +49,7 @@ class SSGE(Estimator):
         radial.check(self.kernel, self.bandwidth, self.baseline)
         if not 0 < self.share <= 1:
             raise ConfigError(f"score.share: got {self.share}; it must be above 0 and at most 1.")
-        for name in ("rank", "landmarks"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"score.{name}: got {getattr(self, name)}; it must be at least 1.")
+        check_at_least_one("score", self, ("rank", "landmarks"))
         if not self.eta >= 0:
             raise ConfigError(f"score.eta: got {self.eta}; it must be at least 0.")
 

@@ -135,6 +135,7 @@ class Expression:
             "measured": measured,
             "measured_angle": tuple(n for n in measured if n in angles),
         }
+        allowed = (self.units,) if self.units and isinstance(self.units, str) else tuple(self.units)
         terms = []
         for place in self.places:
             if place not in members and place not in units:
@@ -143,7 +144,7 @@ class Expression:
                     f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
                 )
             for name in members.get(place, (place,)):
-                if self.units and units[name] not in ((self.units,) if isinstance(self.units, str) else self.units):
+                if allowed and units[name] not in allowed:
                     continue
                 terms += self._at(name, self.term, model, scales, roles.velocity.get(name), units, place)
         return terms

@@ -69,12 +69,39 @@ class Cell(NamedTuple):
         return float(np.nanstd(means, ddof=1)) if len(means) > 1 else 0.0
 
 
-STEPS = {
-    "greybox": "method.residual.steps",
-    "sysid": None,
-    "gp": None,
-}  # where not method.steps; None: trains no network
+STEPS = {"greybox": "method.residual.steps", "sysid": None, "gp": None}  # where not method.steps; None: no network
+FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")
+WHERE = dict.fromkeys(FSVGD, "method.") | {"greybox": "method.residual."}
+# More points of the box than the defaults have, and fewer draws, for every prior over functions (docs/paper.md)
+POINTS = ("pool=1024", "sets=128")
+NEWTON = ("precondition=true", "fresh_points=32")
+DRAWS = dict.fromkeys(FSVGD[:3], 256) | {"pathwise": 512}
+STARTS = {"sysid": "method.starts", "gp": "method.sysid.starts", "greybox": "method.sysid.starts"}
+SPREAD = (
+    "Test NLL, joint over outputs: mean ± standard deviation over model seeds of the mean over data seeds (of one model seed: "
+    "over data seeds). Advantages are paired, with 95 % intervals over data seeds."
+)
 Table = dict[tuple[str, str, int], Cell]  # (system, method, n_train)
+
+
+def words_of(method: str, steps: int, *, newton: bool = False, starts: int | None = None) -> list[str]:
+    """Return the words that a method has beside those of the panel.
+
+    Args:
+        method: name of simpel's.
+        steps: of every method that trains a network.
+        newton: networks under a prior over functions go in Newton's direction.
+        starts: that a simulator is identified from; None: the default.
+    """
+    key = STEPS.get(method, "method.steps")
+    words = [f"{key}={steps}"] if key else []
+    if method in WHERE:
+        words += [f"{WHERE[method]}{point}" for point in (*POINTS, *(NEWTON if newton else ()))]
+    if method in STARTS and starts is not None:
+        words.append(f"{STARTS[method]}={starts}")
+    if method in DRAWS:
+        words.append(f"prior.draws={DRAWS[method]}")
+    return words
 
 
 def options(name: str, about: str | None, methods: Iterable[str]) -> argparse.ArgumentParser:
@@ -95,7 +122,7 @@ def run(fits: Sequence[Fit], out: Path, processes: int) -> None:
     todo = [fit for fit in fits if not _done(fit, out)]
     print(f"{len(fits)} fits, {len(fits) - len(todo)} are there, {len(todo)} to run", flush=True)
     began = time.perf_counter()
-    # a worker has one core: threads of LAPACK, started before it is held to that, wait for each other on it (10 times slower)
+    # a worker has one core: threads of LAPACK, started before it is held to that, would take turns on it
     os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
     cores = context.Queue()

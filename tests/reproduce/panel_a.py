@@ -5,7 +5,7 @@
 Truth: one draw of the high-fidelity parameters per data seed, states and inputs uniform in the box of the data, noise on what
 follows, 1000 test rows. Prior: the low-fidelity simulator. The same data, normalisation, noise model and number of steps for
 every method that learns a network; those with a prior over functions get POINTS of the box, on sergio Newton's direction, too
-(WIDE). Beside the paper: the exact GP about the identified simulator (`gp`), and SimPEL's prior, conditioned in closed form
+(`wide`). Beside the paper: the exact GP about the identified simulator (`gp`), and SimPEL's prior, conditioned in closed form
 (`pathwise`, of no more than method.most_rows training rows: 2048).
 """
 
@@ -19,7 +19,7 @@ from simpel_cli.config import launch
 from simpel_cli.records import write_text
 from tests.reproduce.panel import (
     CONF,
-    STEPS,
+    SPREAD,
     Fit,
     Table,
     advantage,
@@ -32,16 +32,13 @@ from tests.reproduce.panel import (
     run,
     sizes_of,
     verdict,
+    words_of,
 )  # fmt: skip
 from tests.reproduce.static import folder
 
 METHODS = ("simpel", "simpel_only_sim", "fsvgd", "svgd", "greybox", "sysid", "gp", "pathwise")
 BESIDE = ("gp", "pathwise")  # the paper
 TESTS = 1000
-SPREAD = (
-    "Test NLL, joint over outputs: mean ± standard deviation over model seeds of the mean over data seeds (of one model seed: "
-    "over data seeds). Advantages are paired, with 95 % intervals over data seeds."
-)
 LEAST = 0.3  # nats that count as on par
 
 
@@ -56,7 +53,8 @@ class System(NamedTuple):
         initial: state -> range, where it is not the declared one.
         steps: full.
         wide: many states: networks under a prior over functions go in Newton's direction.
-        starts: that the simulator is identified from, where eight take minutes; it ends in the same place from two.
+        starts: that the simulator is identified from, where the eight of the default take minutes; it ends in the same
+            place from two.
     """
 
     truth: str
@@ -66,17 +64,9 @@ class System(NamedTuple):
     initial: dict[str, tuple[float, float]]
     steps: int = 5000
     wide: bool = False
-    starts: int = 8
+    starts: int | None = None
 
 
-# More points of the box than the defaults have, and fewer draws, for every prior over functions: SimPEL gains 0.1 nats on the
-# race car by it and 0.5 to 1.5 in the greenhouse (docs/paper.md).
-POINTS = ("pool=1024", "sets=128")
-NEWTON = ("precondition=true", "fresh_points=32")
-FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")
-WHERE = dict.fromkeys(FSVGD, "method.") | {"greybox": "method.residual."}
-STARTS = {"sysid": "method.starts", "gp": "method.sysid.starts", "greybox": "method.sysid.starts"}
-DRAWS = dict.fromkeys(FSVGD[:3], 256) | {"pathwise": 512}
 CAR = {"x": 1.110899654e-3, "y": 1.110899654e-3, "theta": 1.831563889e-3, "vx": 8.208499862e-3, "vy": 8.208499862e-3,
        "omega": 3.678794412e-2}  # fmt: skip
 SYSTEMS = {
@@ -116,15 +106,6 @@ def listed(values: dict[str, object]) -> str:
     return "{" + ",".join(f"{k}:{list(v) if isinstance(v, tuple) else v}" for k, v in values.items()) + "}"
 
 
-def specifics(method: str, *, wide: bool = False, starts: int = 8) -> tuple[str, ...]:
-    """Return the words that a method has beside the shared ones."""
-    points = (*POINTS, *(NEWTON if wide else ())) if method in WHERE else ()
-    words = [f"{WHERE[method]}{point}" for point in points]
-    words += [f"{STARTS[method]}={starts}"] if method in STARTS else []
-    words += [f"prior.draws={DRAWS[method]}"] if method in DRAWS else []
-    return tuple(words)
-
-
 def measurements(name: str, system: System, data_seed: int, most: int, out: Path) -> Path:
     """Simulate the data of a system and seed, once."""
     rows = TESTS + most
@@ -156,15 +137,9 @@ def fits(
         system = SETTINGS[setting][name]
         sim = name if setting == "informative" else f"{name}_published"
         for method in methods:
-            more = specifics(method, wide=system.wide, starts=system.starts)
+            gap: tuple[str, ...] = ()
             if setting == "published" and method in ("simpel", "gp", "pathwise"):
-                more = (
-                    *more,
-                    "prior.gap.scale=declared",
-                    "prior.gap.lengthscale=10",
-                    "prior.gap.lengthscale_units=raw",
-                )
-            key = STEPS.get(method, "method.steps")
+                gap = ("prior.gap.scale=declared", "prior.gap.lengthscale=10", "prior.gap.lengthscale_units=raw")
             for n in system.small if small else system.sizes:
                 # as published 60 passes of 8 rows beside 5000 steps; there are fewer in the small panel
                 steps = max(1, round(share * (system.steps if small else min(60 * n // 8 + system.steps, 100_000))))
@@ -175,9 +150,9 @@ def fits(
                     words = [
                         f"sim={sim}", "data=panel", f"data.path={path}", f"data.noise_std={listed(dict(system.noise))}",
                         f"data.n_train={n}", f"data.seed={data_seed}", f"method={method}", f"run.name={name}",
-                        f"run.seeds={model_seeds}",
+                        f"run.seeds={model_seeds}", *words_of(method, steps, newton=system.wide, starts=system.starts), *gap,
                     ]  # fmt: skip
-                    every.append(Fit(name, method, n, data_seed, (*words, *([f"{key}={steps}"] if key else []), *more)))
+                    every.append(Fit(name, method, n, data_seed, tuple(words)))
     return every
 
 

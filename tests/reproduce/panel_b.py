@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.records import write_text
 from tests.reproduce.panel import (
-    STEPS,
+    SPREAD,
     Fit,
     Table,
     advantage,
@@ -25,8 +25,8 @@ from tests.reproduce.panel import (
     run,
     sizes_of,
     verdict,
+    words_of,
 )  # fmt: skip
-from tests.reproduce.panel_a import SPREAD, specifics
 from tests.reproduce.static import folder
 
 SYSTEM = "rc_car"
@@ -55,7 +55,6 @@ def fits(methods: list[str], data_seeds: int, model_seeds: int, small: bool, sha
     every = []
     for name in methods:
         method, sim = METHODS[name]
-        key = STEPS.get(method, "method.steps")
         for n in SMALL if small else SIZES:
             # as published: 60 passes of 8 rows beside 5000 steps
             steps = (
@@ -64,7 +63,7 @@ def fits(methods: list[str], data_seeds: int, model_seeds: int, small: bool, sha
             for data_seed in range(data_seeds):
                 words = [
                     "experiment=rc_car", f"sim={sim}", f"method={method}", f"data.n_train={n}", f"data.seed={data_seed}",
-                    "run.name=rc_car", f"run.seeds={model_seeds}", *([f"{key}={steps}"] if key else []), *specifics(method),
+                    "run.name=rc_car", f"run.seeds={model_seeds}", *words_of(method, steps),
                 ]  # fmt: skip
                 place = name.replace(", ", "_").replace(" ", "_")
                 every.append(Fit(SYSTEM, place, n, data_seed, tuple(words)))
