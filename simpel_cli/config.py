@@ -44,6 +44,11 @@ def recordings_dir() -> Path:
     return folder
 
 
+CONTROL = ("rl-offline", "rl-online")
+# group -> key, of the verbs of control: an experiment brings them, there is no default
+BROUGHT = {"reward": "reward", "sim@truth": "truth"}
+
+
 class Job(typing.NamedTuple):
     """One composed, resolved configuration."""
 
@@ -76,7 +81,7 @@ def launch(
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    words = checked(overrides)
+    words = checked(_appended(verb, overrides))
     user = _user_conf(config_dir)
     if "--cfg" not in flags:
         _refuse_other_runs(overrides)
@@ -200,6 +205,13 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("run_id", lambda: run_id, replace=True)
 
 
+def _appended(verb: str, overrides: list[str]) -> list[str]:
+    """Say `+group=` for a group that an experiment would bring, where there is none to bring it."""
+    if verb not in CONTROL or any(word.startswith("experiment=") for word in overrides):
+        return overrides
+    return [f"+{word}" if word.partition("=")[0] in BROUGHT else word for word in overrides]
+
+
 def _force(override: str) -> str:
     """Let `a.b=c` set what the YAML leaves out; `nodes.build` then tells a field from a typo."""
     return f"++{override}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*(\.[\w\[\]]+)+=", override) else override
@@ -233,12 +245,14 @@ def _of_other_verbs(verb: str) -> set[str]:
     """Groups and keys that an experiment may set for another verb that takes experiments: it serves all of them."""
     verbs = [path.stem for path in conf_dir().glob("*.yaml")]
     entries = {other: _entries(other) for other in verbs if other != verb}
-    return {key for keys in entries.values() if "experiment" in keys for key in keys}
+    brought = set(BROUGHT.values()) if verb not in CONTROL else set()
+    return {key for keys in entries.values() if "experiment" in keys for key in keys} | brought
 
 
 def _top_level(verb: str) -> list[str]:
     """Groups and keys of a root configuration and of those that it builds on."""
-    return [name for name in _entries(verb) if name != "experiment"]
+    brought = list(BROUGHT.values()) if verb in CONTROL else []
+    return [*(name for name in _entries(verb) if name != "experiment"), *brought]
 
 
 def _entries(verb: str) -> list[str]:

@@ -81,11 +81,7 @@ def fit(
       simpel fit --config-dir my sim=rig data=rig data.n_train=50 run.seeds=5
     """
     if resume is not None:
-        if overrides or config_dir or cfg or multirun:
-            raise ConfigError(
-                "--resume: a resumed run takes nothing else; its configuration is in "
-                f"{resume / 'config.yaml'}. For other settings start a new run."
-            )
+        _refuse_more(resume, overrides, config_dir, cfg, multirun)
         from simpel_cli.commands.fit import resume as go_on
 
         go_on(resume)
@@ -144,6 +140,31 @@ def discover(
     _launch("discover", partial(task, strict=strict), overrides, config_dir, cfg)
 
 
+@app.command("rl-offline")
+def rl_offline(
+    overrides: Overrides = None,
+    config_dir: ConfigDir = None,
+    cfg: Cfg = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on with an interrupted run.")] = None,
+) -> None:
+    """Learn a policy in a model that was fitted to measurements, and judge it in the true world.
+
+    Examples:
+      simpel rl-offline experiment=rc_car_parking data.n_train=200
+
+      simpel rl-offline --config-dir my sim=rig data=rig reward=my_task sim@truth=rig_as_i_know_it
+    """
+    if resume is not None:
+        _refuse_more(resume, overrides, config_dir, cfg)
+        from simpel_cli.commands.rl_offline import resume as go_on
+
+        go_on(resume)
+    else:
+        from simpel_cli.commands.rl_offline import rl_offline as task
+
+        _launch("rl-offline", task, overrides, config_dir, cfg)
+
+
 @app.command()
 def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
     """Fit every combination of values and collect the results.
@@ -170,6 +191,14 @@ def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg
     from simpel_cli.commands.simulate import simulate as task
 
     _launch("simulate", task, overrides, config_dir, cfg)
+
+
+def _refuse_more(resume: Path, *given: object) -> None:
+    if any(given):
+        raise ConfigError(
+            "--resume: a resumed run takes nothing else; its configuration is in "
+            f"{resume / 'config.yaml'}. For other settings start a new run."
+        )
 
 
 def _launch(

@@ -18,7 +18,14 @@ from typing import Any
 from simpel_cli.errors import ConfigError, did_you_mean
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
-ROLES = {"sim": "model", "prior": "uses_simulator", "score": "gap_draws", "method": "bind"}
+ROLES = {
+    "sim": "model",
+    "prior": "uses_simulator",
+    "score": "gap_draws",
+    "method": "bind",
+    "policy": "bind",
+    "reward": "bind",
+}
 
 
 def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type | None = None) -> Any:

@@ -2,12 +2,13 @@
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from simpel_cli import loop
+from simpel_cli.commands.checkpoint import keep, restored
 from simpel_cli.commands.judge import Judged, judge
 from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
@@ -16,11 +17,19 @@ from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, poster
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
-from simpel_cli.records import MetricStream, load_checkpoint, save_checkpoint, write_table, write_text
+from simpel_cli.records import MetricStream, write_table, write_text
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
 
 LOG_EVERY = 50  # steps per row of the metric table
 DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
+
+
+class Learned(NamedTuple):
+    """What a fit came to: the state of every seed's posterior (leaves (seeds, ...)), and what it is bound to."""
+
+    study: Study
+    fitted: Fitted
+    state: Any
 
 
 def fit(job: Job) -> None:
@@ -48,7 +57,29 @@ def resume(directory: Path) -> None:
         _run(config, directory, directory, manifest, resume=True)
 
 
-def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool) -> None:
+def learned(config: dict[str, Any], directory: Path, data_folder: Path) -> Learned:
+    """Return the posterior of a fit in a directory of its own: what is complete is read, what is not is gone on with.
+
+    Args:
+        config: resolved, of `simpel fit`.
+        directory: of the fit.
+        data_folder: of the data YAML.
+    """
+    begun = (directory / "manifest.json").exists()
+    record = read_manifest(directory) if begun else {}
+    inputs = record.get("inputs_sha256") or {}
+    if record.get("status") == "done":
+        study = open_study(config, directory)
+        refuse_changed_inputs(record, study.recording.files)
+        _, state, fitted = checkpointed_state(directory, prepare(study))
+        return Learned(study, fitted, state)
+    make_directory(directory)
+    write_text(directory / "config.yaml", dump(config))
+    with Manifest(directory, "fit", settings_of(config), inputs=dict(inputs)) as manifest:
+        return _run(config, directory, data_folder, manifest, resume=begun)
+
+
+def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool) -> Learned:
     study = open_study(config, data_folder)
     if resume:
         refuse_changed_inputs({"inputs_sha256": manifest.inputs}, study.recording.files)
@@ -77,6 +108,7 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         metrics.close()
     table = run_table(study, fitted, judged, manifest)
     publish(terminal, study, judged, directory, dump(config), "fit", table)
+    return Learned(study, fitted, state)
 
 
 def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> None:
@@ -111,9 +143,7 @@ def _train(
             state = stretch.state
             # rows first: a kill in between leaves rows beyond the checkpoint, which resume cuts off and makes again
             metrics.add(_training_rows(study, stretch, encoding, y_std))
-            save_checkpoint(
-                directory / "checkpoint", _leaves(_kept(fitted, state)), {"step": stretch.step, "command": "fit"}
-            )
+            keep(directory, _kept(fitted, state), {"step": stretch.step, "command": "fit"})
             loss = float(stretch.info.loss[:, -LOG_EVERY:].mean())
             noise = " ".join(f"{v:.2g}" for v in stretch.info.noise_std[:, -1].mean(axis=0) * y_std)
             update(stretch.step, f"loss {loss:.3g}  noise {noise}  {compile_note}")
@@ -134,10 +164,6 @@ def _training_rows(study: Study, stretch: loop.Stretch, encoding: Any, y_std: np
             for name, unit, value in zip(encoding.y_names, encoding.y_units, part.noise_std[i] * y_std, strict=True):
                 rows.append(base | {"metric": "noise_std", "output": name, "unit": unit, "value": float(value)})
     return rows
-
-
-def _leaves(tree: Any) -> dict[str, np.ndarray]:
-    return {jax.tree_util.keystr(p): np.asarray(v) for p, v in jax.tree_util.tree_leaves_with_path(tree)}
 
 
 def _kept(fitted: Fitted, state: Any) -> dict[str, Any]:
@@ -162,20 +188,7 @@ def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitte
     Raises:
         ConfigError: no checkpoint, a damaged one, or one of another configuration.
     """
-    arrays, facts = load_checkpoint(directory / "checkpoint")
     shape = _kept(fitted, loop.state_shape(fitted.bind, fitted.assembled.problems, fitted.keys))
-    paths, structure = jax.tree_util.tree_flatten_with_path(shape)
-    leaves = []
-    for path, expected in paths:
-        name = jax.tree_util.keystr(path)
-        found = arrays.get(name)
-        if found is None or found.shape != expected.shape or found.dtype != expected.dtype:
-            what = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
-            raise ConfigError(
-                f"{directory / 'checkpoint'}: `{name}` is {what}; this configuration needs "
-                f"{expected.dtype}{list(expected.shape)}. The checkpoint belongs to another configuration."
-            )
-        leaves.append(jax.numpy.asarray(found))
-    kept = jax.tree_util.tree_unflatten(structure, leaves)
+    kept, facts = restored(directory, shape)
     assembled = fitted.assembled._replace(problems=fitted.assembled.problems._replace(**kept["problem"]))
     return int(facts["step"]), kept["state"], fitted._replace(assembled=assembled)

@@ -21,7 +21,10 @@ from simpel_cli.problem import Assembled, System, assemble, normaliser_of, syste
 from simpel_cli.run import Settings, configure, stream
 
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
-GROUPS = ("run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery")
+GROUPS = (
+    "run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery", "policy", "control",
+    "reward", "truth",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -216,6 +216,8 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
     steps = found["error"]["horizon_steps"]
     goes = "falls" if second[best] < first[best] else "does not fall: it goes"
     gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
+    if not np.isfinite(ratio).any():
+        gain = f"No test episode is more than {steps} rows long, so that errors as far ahead are not known (discovery.horizon)."
     parts = [_phrase(e) for e in found["effects"]]
     listed = " and ".join(parts)
     rest = f" What is left depends on {dependence(found['remainder'])}." if found["remainder"] else ""

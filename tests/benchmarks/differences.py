@@ -49,7 +49,9 @@ DIFFERENCES = {
         ("input_exchange on T_p", "thermal_coupling on T_p", "input_exchange on V"),
     ),
     "sergio": Difference(
-        ("discovery.rows=300",), "regulation of genes by each other, quadratic Hill function", both=("sim.genes=3",)
+        ("discovery.rows=300", "discovery.horizon=10"),
+        "regulation of genes by each other, quadratic Hill function",
+        both=("sim.genes=3",),
     ),
 }
 

@@ -1,0 +1,230 @@
+"""Training of policies in the posteriors of a fit: shared by `rl-offline` and `rl-online`."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli import loop
+from simpel_cli.commands.checkpoint import keep, restored
+from simpel_cli.commands.fit import Learned
+from simpel_cli.commands.study import source_of
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError
+from simpel_cli.inference import Problem
+from simpel_cli.nodes import build
+from simpel_cli.records import MetricStream
+from simpel_cli.rl.control import Control
+from simpel_cli.rl.policy import Policy
+from simpel_cli.rl.rollout import Episodes, episodes
+from simpel_cli.rl.sac import SAC, Rule
+from simpel_cli.rl.task import Goal, Task
+from simpel_cli.rl.world import World, beginning_at, learned_world, true_world
+from simpel_cli.run import Settings, stream
+from simpel_cli.transition import encoding_of, transition
+from simulators.model import Model, Quantity
+
+Judge = Callable[[Policy, PRNGKeyArray], Episodes]  # leaves of the policy (runs, ...)
+
+
+class Assignment(NamedTuple):
+    """What a controller is asked for, and where.
+
+    Args:
+        task: as declared.
+        goal: bound to the quantities.
+        control: how the policy meets the model.
+        policy: how it learns.
+        truth: the true world; None: there is none to judge in.
+        truth_name: its name.
+    """
+
+    task: Task
+    goal: Goal
+    control: Control
+    policy: SAC
+    truth: World | None
+    truth_name: str
+
+
+class Best(NamedTuple):
+    """Policies of the largest return in the model so far, of every run (seeds times policies)."""
+
+    policy: Policy
+    returns: Float[Array, " runs"]
+
+
+class Flown(NamedTuple):
+    """What training a policy came to.
+
+    Args:
+        policies: the best of every seed, leaves (seeds, ...).
+        model_returns: what they earn in the model, per seed.
+        seconds: of training.
+        compile_seconds: of it.
+    """
+
+    policies: Policy
+    model_returns: np.ndarray
+    seconds: float
+    compile_seconds: float
+
+
+def assignment(config: dict[str, Any], learned: Learned, settings: Settings) -> Assignment:
+    """Build the groups of control.
+
+    Raises:
+        ConfigError: a key, or quantities of the truth that are not those of the simulator.
+    """
+    if not config.get("reward"):
+        raise ConfigError("reward: missing; name a task, e.g. reward=parking, or an experiment that brings one.")
+    encoding = learned.study.system.encoding
+    if not encoding.states or encoding.outputs:
+        raise ConfigError(
+            f"sim: {learned.study.system.source.name} cannot be controlled in a learned model: every state has to be measured."
+        )
+    task = build(config["reward"], "reward", settings.plugins, default=Task)
+    goal = task.bind(encoding)
+    control = build(config.get("control") or {}, "control", default=Control)
+    policy = build(config["policy"], "policy", settings.plugins, default=SAC)
+    truth, name = None, ""
+    if config.get("truth"):
+        source = source_of({"sim": config["truth"]}, settings)
+        truth, name = _true_world(source, task, goal, encoding.stack, learned), source.name
+    return Assignment(task, goal, control, policy, truth, name)
+
+
+def _true_world(source: Any, task: Task, goal: Goal, stack: int, learned: Learned) -> World:
+    if not isinstance(source, Model):
+        raise ConfigError(
+            f"truth: {source.name} answers queries only; name a simulator with equations, e.g. sim@truth=..."
+        )
+    encoding = encoding_of(source, stack=stack)
+    own = learned.study.system.encoding
+    for what in ("states", "inputs"):
+        have, need = ([q.name for q in getattr(e, what)] for e in (encoding, own))
+        if have != need:
+            raise ConfigError(
+                f"truth: {what} of {source.name} are {', '.join(have)}; those of sim are {', '.join(need)}."
+            )
+    dtype = jnp.float32
+    phi = jnp.asarray([_middle(q) for q in source.params], dtype)
+    noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], dtype)
+    return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
+
+
+def _middle(q: Quantity) -> float:
+    return (q.low * q.high) ** 0.5 if q.prior == "lognormal" else (q.low + q.high) / 2
+
+
+def train(learned: Learned, asked: Assignment, terminal: Terminal, metrics: MetricStream, directory: Path) -> Flown:
+    """Train policies in every seed's posterior; the best of each seed, by what it earns in the model, is kept.
+
+    A checkpoint in the directory is gone on with.
+    """
+    sac, control, task = asked.policy, asked.control, asked.task
+    study, fitted = learned.study, learned.fitted
+    seeds, runs = study.settings.all_seeds, len(study.settings.all_seeds) * sac.policies
+    encoding, dim_u = study.system.encoding, len(study.system.encoding.inputs)
+
+    def world_at(arrays: tuple[Problem, Any], share: float) -> World:
+        problem, state = arrays
+        rule = fitted.bind(problem)
+        noise = rule.predict(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype)).noise_std
+        world = learned_world(
+            encoding, asked.goal, lambda x: rule.members(state, x), noise, study.method.particles, control.sampling,
+            aleatoric=control.aleatoric,
+        )  # fmt: skip
+        return beginning_at(world, encoding, jnp.asarray(problem.x), jnp.asarray(problem.m), share)
+
+    def bind(arrays: tuple[Problem, Any]) -> Rule:
+        return sac.bind(world_at(arrays, control.data_share), task.horizon, dim_u)
+
+    problems = jax.tree.map(
+        lambda a: jnp.repeat(jnp.asarray(a), sac.policies, axis=0), (fitted.assembled.problems, learned.state)
+    )
+    keys = jnp.stack([jax.random.fold_in(stream(s, "policy"), i) for s in seeds for i in range(sac.policies)])
+    multiple = 1 if control.sampling == "mean" else study.method.particles
+    iterations = sac.iterations(multiple)
+    stretch = max(1, -(-iterations // sac.looks))
+    judged = -(-control.episodes // multiple) * multiple
+
+    def in_model(arrays: tuple[Problem, Any], policy: Policy, key: PRNGKeyArray) -> tuple[Any, Any]:
+        found = episodes(
+            world_at(arrays, 0.0), lambda seen: bind(arrays).actor.act(policy, seen), key, judged, task.horizon
+        )
+        return jnp.mean(found.returns), jnp.mean(found.broken.astype(jnp.float32))
+
+    model_judge = jax.jit(jax.vmap(in_model, in_axes=(0, 0, None)))
+    truth_judge = judge_of(asked, dim_u) if asked.truth is not None else None
+    policies_of = jax.jit(jax.vmap(lambda arrays, state: bind(arrays).policy(state)))
+
+    program = loop.compiled(bind, problems, keys, stretch)
+    shape = loop.state_shape(bind, problems, keys)
+    start, state, best = 0, None, None
+    if (directory / "checkpoint" / "state.safetensors").exists():
+        empty = jax.eval_shape(lambda p, s: Best(policies_of(p, s), jnp.zeros(runs, jnp.float32)), problems, shape)
+        (state, best), facts = restored(directory, (shape, empty))
+        start = int(facts["step"])
+    began = time.perf_counter()
+    per = sac.side_by_side(multiple) * sac.collect
+    with terminal.progress("policy", iterations, start) as update:
+        for one in loop.train(program, iterations, state=state, start=start):
+            now = policies_of(problems, one.state)
+            earned, broken = model_judge(problems, now, stream(0, "judge"))
+            best = Best(now, earned) if best is None else _better(best, Best(now, earned))
+            true = (
+                np.asarray(truth_judge(now, stream(0, "truth")).reward.sum(axis=1).mean(axis=1))
+                if truth_judge
+                else None
+            )
+            metrics.add(_rows(seeds, sac.policies, one.step * per, np.asarray(earned), np.asarray(broken), true))
+            keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
+            note = f"return in the model {float(best.returns.max()):.4g}"
+            update(one.step, note + (f", in the truth {true.max():.4g}" if true is not None else ""))
+    assert best is not None
+    return _of_seeds(best, len(seeds), sac.policies, time.perf_counter() - began, program.compile_seconds)
+
+
+def judge_of(asked: Assignment, dim_u: int) -> Judge:
+    """Return the compiled judge of policies in the true world; leaves of the episodes (runs, ...)."""
+    world, sac, task = asked.truth, asked.policy, asked.task
+    assert world is not None
+    actor = sac.bind(world, task.horizon, dim_u).actor
+
+    def one(policy: Policy, key: PRNGKeyArray) -> Episodes:
+        return episodes(world, lambda seen: actor.act(policy, seen), key, asked.control.episodes, task.horizon)
+
+    judged: Judge = jax.jit(jax.vmap(one, in_axes=(0, None)))
+    return judged
+
+
+def _better(old: Best, new: Best) -> Best:
+    """Keep, run by run, what earns more in the model."""
+    more = new.returns > old.returns
+    return jax.tree.map(lambda a, b: jnp.where(more.reshape(-1, *[1] * (a.ndim - 1)), b, a), old, new)
+
+
+def _of_seeds(best: Best, seeds: int, policies: int, seconds: float, compile_seconds: float) -> Flown:
+    returns = np.asarray(best.returns).reshape(seeds, policies)
+    chosen = returns.argmax(axis=1) + np.arange(seeds) * policies
+    return Flown(jax.tree.map(lambda a: a[chosen], best.policy), returns.max(axis=1), seconds, compile_seconds)
+
+
+def _rows(
+    seeds: list[int], policies: int, step: int, model: np.ndarray, broken: np.ndarray, truth: np.ndarray | None
+) -> list[dict[str, Any]]:
+    """Metric rows of one look; output: which of the policies."""
+    rows = []
+    for i, seed in enumerate(np.repeat(seeds, policies).tolist()):
+        base = {"seed": seed, "step": step, "split": "train", "output": f"policy {i % policies}", "unit": "1"}
+        rows.append(base | {"metric": "return_in_model", "value": float(model[i])})
+        rows.append(base | {"metric": "broken_in_model", "value": float(broken[i])})
+        if truth is not None:
+            rows.append(base | {"metric": "return_in_truth", "value": float(truth[i])})
+    return rows

@@ -1,0 +1,194 @@
+"""`simpel rl-offline`: learn a policy in the posterior of a fit, judge it in the true world."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, train
+from simpel_cli.commands.fit import Learned, learned
+from simpel_cli.commands.study import resolved, settings_of
+from simpel_cli.config import Job, dump, load
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError
+from simpel_cli.plots.canvas import with_interval
+from simpel_cli.plots.control import draw_control
+from simpel_cli.records import MetricStream, load_checkpoint, write_table, write_text
+from simpel_cli.report import figure, write_report
+from simpel_cli.rl.files import contract, save_policy
+from simpel_cli.rl.rollout import Episodes
+from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, stream
+
+OWN = ("policy", "reward", "truth", "control")  # groups that a fit does not have
+
+
+def rl_offline(job: Job) -> None:
+    """Run in a new directory."""
+    directory = make_directory(job.directory)
+    refuse_occupied(directory)
+    config = resolved(job)
+    write_text(directory / "config.yaml", dump(config))
+    with Manifest(directory, "rl-offline", settings_of(config)) as manifest:
+        _run(config, directory, job.data_folder, manifest)
+
+
+def resume(directory: Path) -> None:
+    """Go on with an interrupted run, bit for bit as if it had not been interrupted."""
+    record = read_manifest(directory)
+    if record["command"] != "rl-offline":
+        raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-offline.")
+    config = load(directory / "config.yaml")
+    if record.get("status") == "done":
+        Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
+        return
+    with Manifest(directory, "rl-offline", settings_of(config)) as manifest:
+        _run(config, directory, directory, manifest)
+
+
+def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest) -> None:
+    fit = {key: value for key, value in config.items() if key not in OWN}
+    model = learned(fit, directory / "posterior", data_folder)
+    study = model.study
+    manifest.add_inputs(study.recording.files)
+    manifest.facts["device"] = str(study.device)
+    terminal = Terminal(study.settings.quiet, directory / "run.log")
+    asked = assignment(config, model, study.settings)
+    terminal.line()
+    terminal.line(_task_line(asked), "task")
+    constants = study.constants | {
+        "run": directory.name, "command": "rl-offline", "n_train": len(model.fitted.training[0][0])
+    }  # fmt: skip
+    with MetricStream(directory, constants, resume_at=_done_steps(directory)) as metrics:
+        flown = train(model, asked, terminal, metrics, directory)
+        manifest.facts |= {
+            "compile_seconds": round(flown.compile_seconds, 3), "policy_seconds": round(flown.seconds, 3),
+            "n_train": constants["n_train"],
+        }  # fmt: skip
+        judged = _judged(model, asked, flown, directory)
+        metrics.add(_rows(study.settings.all_seeds, asked, flown, judged))
+        metrics.close()
+    memory = asked.truth.memory if asked.truth is not None else study.system.encoding.stack
+    facts = contract(study.system.encoding, asked.goal, memory, study.system.source.dt)
+    best = int(np.argmax(flown.model_returns))
+    for i, seed in enumerate(study.settings.all_seeds):
+        folder = directory / "policy" if i == best else directory / f"policy_seed_{seed}"
+        save_policy(folder, _of_run(flown.policies, i), facts)
+    _publish(config, terminal, model, asked, flown, judged, directory)
+
+
+def _done_steps(directory: Path) -> int | None:
+    """Return the steps of the world at the checkpoint, if there is one."""
+    if not (directory / "checkpoint" / "state.safetensors").exists():
+        return None
+    return int(load_checkpoint(directory / "checkpoint")[1]["world_steps"])
+
+
+def _of_run(tree: Any, i: int) -> Any:
+    import jax
+
+    return jax.tree.map(lambda a: a[i], tree)
+
+
+def _task_line(asked: Assignment) -> str:
+    where = (
+        f"judged in {asked.truth_name}" if asked.truth is not None else "no true world to judge in (truth: a simulator)"
+    )
+    return (
+        f"{asked.task.horizon} steps   {asked.policy.policies} policies of {asked.policy.steps} steps each, "
+        f"sampling {asked.control.sampling}   {where}"
+    )
+
+
+def _judged(model: Learned, asked: Assignment, flown: Flown, directory: Path) -> Episodes | None:
+    """Judge the policies in the true world and write their episodes."""
+    if asked.truth is None:
+        return None
+    encoding = model.study.system.encoding
+    found = judge_of(asked, len(encoding.inputs))(flown.policies, stream(0, "judge in the truth"))
+    runs, steps, number = found.reward.shape
+    states = np.asarray(encoding.decode(found.encoded))[:, 1:]
+    low, high = np.array(asked.goal.low), np.array(asked.goal.high)
+    commands = low + (high - low) * (np.asarray(found.action) + 1) / 2
+    shape = (runs, steps, number)
+    columns: dict[str, Any] = {
+        "seed": np.broadcast_to(np.array(model.study.settings.all_seeds)[:, None, None], shape).ravel(),
+        "episode": np.broadcast_to(np.arange(number)[None, None], shape).ravel(),
+        "step": np.broadcast_to(np.arange(1, steps + 1)[None, :, None], shape).ravel(),
+    }
+    columns |= {q.name: states[..., i].ravel() for i, q in enumerate(encoding.states)}
+    columns |= {q.name: commands[..., i].ravel() for i, q in enumerate(encoding.inputs)}
+    columns |= {"reward": np.asarray(found.reward).ravel(), "good": np.asarray(found.good).ravel()}
+    columns |= {"counts": np.asarray(found.lived).ravel()}
+    units = {q.name: q.unit for q in (*encoding.states, *encoding.inputs)}
+    write_table(directory / "episodes.parquet", columns, units)
+    return found
+
+
+def _rows(seeds: list[int], asked: Assignment, flown: Flown, judged: Episodes | None) -> list[dict[str, Any]]:
+    rows = []
+    for i, seed in enumerate(seeds):
+        base = {"seed": seed, "step": asked.policy.steps, "split": "test", "output": "", "unit": "1"}
+        rows.append(base | {"metric": "return_in_model", "value": float(flown.model_returns[i])})
+        if judged is not None:
+            own = _of_run(judged, i)
+            rows.append(base | {"metric": "return_in_truth", "value": float(np.mean(own.returns))})
+            rows.append(base | {"metric": "success", "value": float(np.mean(own.succeeded(asked.task.settled)))})
+    return rows
+
+
+def _publish(
+    config: dict[str, Any],
+    terminal: Terminal,
+    model: Learned,
+    asked: Assignment,
+    flown: Flown,
+    judged: Episodes | None,
+    directory: Path,
+) -> None:
+    """Print the result, draw the figures, write the report, and say what to type next."""
+    study = model.study
+    seeds = study.settings.all_seeds
+    head = ("seed", "return in the model", "return in the truth", "nine in ten episodes", "succeeded")
+    rows = []
+    for i, seed in enumerate(seeds):
+        cells = [str(seed), f"{flown.model_returns[i]:.4g}"]
+        if judged is not None:
+            own = _of_run(judged, i)
+            returns = np.asarray(own.returns)
+            half = 1.96 * returns.std(ddof=1) / len(returns) ** 0.5
+            ends = np.quantile(returns, [0.05, 0.95])
+            cells += [
+                with_interval(returns.mean(), returns.mean() - half, returns.mean() + half),
+                f"{ends[0]:.4g} to {ends[1]:.4g}",
+                f"{100 * float(np.mean(own.succeeded(asked.task.settled))):.0f} %" if asked.task.success else "-",
+            ]
+        else:
+            cells += ["-", "-", "-"]
+        rows.append(tuple(cells))
+    terminal.line()
+    for row in rows:
+        terminal.line(
+            f"seed {row[0]}: return in the model {row[1]}, in the truth {row[2]}, succeeded {row[4]}", "judged"
+        )
+    images = draw_control(directory, asked.task.horizon) if study.settings.figures else []
+    commands = [
+        f"python {directory / 'policy' / 'run_policy.py'}          # numpy and safetensors only: see its first lines",
+        f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
+    ]
+    note = (
+        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in {asked.truth_name}; intervals over episodes."
+        if judged is not None
+        else "There is no true world to judge in: name one with sim@truth=, or try the policy on the rig."
+    )
+    report = write_report(
+        directory / "report.html",
+        title=f"simpel rl-offline · {study.settings.name} · {study.choices.get('method', '')}",
+        lead=f"{len(model.fitted.training[0][0])} transitions of {study.recording.files[0].name}, "
+        f"{asked.policy.policies} policies per seed, of which the best in the model is kept.",
+        sections=[{"title": "Returns", "head": head, "rows": rows, "note": note}, *(figure(path) for path in images)],
+        commands=commands,
+        config=dump(config),
+    )
+    terminal.line(str(report), "report")
+    for label, line in zip(["next", ""], commands, strict=True):
+        terminal.line(f"{'' if label else ' ' * 10}{line}", label)

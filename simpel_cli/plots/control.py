@@ -1,0 +1,111 @@
+"""Figures of control: learning curves, paths in the true world, the manoeuvre as a film. From Parquet only."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.plots.canvas import (
+    BLACK,
+    COLOURS,
+    columns_of,
+    distinct,
+    legend_below,
+    new_figure,
+    save,
+    units_of,
+    with_unit,
+)
+from simpel_cli.records import read_metrics, replacing
+
+SHOWN = 20  # paths of episodes
+FRAMES = 100
+DURATION = 67  # of a frame, ms
+
+
+def draw_control(directory: Path, horizon: int) -> list[Path]:
+    """Draw what a run's Parquet files tell; the film is not part of the list."""
+    made = []
+    rows = [r for r in read_metrics(directory / "metrics.parquet") if r["split"] == "train"]
+    if rows:
+        made.append(save(_curves(rows), directory / "learning_curves.png"))
+    path = directory / "episodes.parquet"
+    if path.exists():
+        table, units = columns_of(path), units_of(path)
+        made.append(save(_paths(table, units), directory / "trajectories.png"))
+        if {"x", "y", "theta"} <= set(table):
+            _film(table, directory / "manoeuvre.gif")
+    return made
+
+
+def _curves(rows: list[dict[str, Any]]) -> Any:
+    labels = {"return_in_model": "in the model", "return_in_truth": "in the truth"}
+    figure, axes = new_figure(1, 5.0, 3.4)
+    for i, (metric, label) in enumerate(labels.items()):
+        own = [r for r in rows if r["metric"] == metric]
+        for j, key in enumerate(distinct((r["seed"], r["output"]) for r in own)):
+            line = [(r["step"], r["value"]) for r in own if (r["seed"], r["output"]) == key]
+            axes[0].plot(
+                *zip(*line, strict=True), color=COLOURS[i], linewidth=1, alpha=0.8, label=label if j == 0 else None
+            )
+    axes[0].set(title="learning curve, a line per policy", xlabel="steps of the model", ylabel="return")
+    legend_below(figure, axes[0])
+    return figure
+
+
+def _paths(table: dict[str, np.ndarray], units: dict[str, str]) -> Any:
+    first = table["seed"] == table["seed"][0]
+    names = [n for n in units if n not in ("x", "y")] if {"x", "y"} <= set(units) else list(units)
+    plane = {"x", "y"} <= set(units)
+    figure, axes = new_figure(len(names) + plane, columns=3)
+    for episode in distinct(table["episode"][first])[:SHOWN]:
+        own = first & (table["episode"] == episode) & table["counts"].astype(bool)
+        order = np.argsort(table["step"][own])
+        style = {"color": COLOURS[0], "alpha": 0.4, "linewidth": 0.9}
+        if plane:
+            axes[0].plot(table["x"][own][order], table["y"][own][order], **style)
+        for axis, name in zip(axes[plane:], names, strict=True):
+            axis.plot(table["step"][own][order], table[name][own][order], **style)
+    if plane:
+        axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
+        axes[0].set(
+            title="paths in the true world", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"])
+        )
+        axes[0].set_aspect("equal", adjustable="datalim")
+    for axis, name in zip(axes[plane:], names, strict=True):
+        axis.set(title=name, xlabel="step", ylabel=with_unit(name, units[name]))
+    return figure
+
+
+def _film(table: dict[str, np.ndarray], path: Path) -> None:
+    """Draw the episode of the median return as a car on the plane."""
+    from PIL import Image
+
+    first = table["seed"] == table["seed"][0]
+    numbers = distinct(table["episode"][first])
+    returns = [table["reward"][first & (table["episode"] == e)].sum() for e in numbers]
+    median = numbers[int(np.argsort(returns)[len(returns) // 2])]
+    own = first & (table["episode"] == median)
+    order = np.argsort(table["step"][own])
+    x, y, theta = (table[name][own][order] for name in ("x", "y", "theta"))
+    every = max(1, len(x) // FRAMES)
+    figure, (axis,) = new_figure(1, 4.5, 4.0)
+    margin = 0.5
+    axis.set(
+        xlim=(min(x.min(), 0) - margin, max(x.max(), 0) + margin), ylim=(min(y.min(), 0) - margin, max(y.max(), 0) + margin),
+        aspect="equal", xlabel="x", ylabel="y",
+    )  # fmt: skip
+    axis.plot(0, 0, "+", color=BLACK, markersize=12)
+    (trail,) = axis.plot([], [], color=COLOURS[0], linewidth=1)
+    (car,) = axis.plot([], [], color=COLOURS[1], linewidth=2)
+    outline = np.array([[-0.15, -0.08], [0.15, -0.08], [0.22, 0], [0.15, 0.08], [-0.15, 0.08], [-0.15, -0.08]])
+
+    frames = []
+    for k in range(0, len(x), every):
+        turn = np.array([[np.cos(theta[k]), np.sin(theta[k])], [-np.sin(theta[k]), np.cos(theta[k])]])
+        trail.set_data(x[: k + 1], y[: k + 1])
+        car.set_data(*(outline @ turn + [x[k], y[k]]).T)
+        figure.canvas.draw()
+        frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+    with replacing(path) as temporary:
+        frames[0].save(temporary, format="GIF", save_all=True, append_images=frames[1:], duration=DURATION, loop=0)

@@ -1,0 +1,32 @@
+"""The `control:` group: how a policy meets the model, and how it is judged."""
+
+from dataclasses import dataclass
+
+from simpel_cli.errors import ConfigError, check_at_least_one, did_you_mean
+from simpel_cli.rl.world import SAMPLING
+
+
+@dataclass(frozen=True)
+class Control:
+    """How a policy is trained in a posterior, and judged.
+
+    Args:
+        sampling: of the posterior: `ts1` a particle drawn anew at every step, `tsinf` one for a whole roll-out, `mean` the mean
+            of all particles.
+        aleatoric: whether roll-outs have the learned noise, too.
+        data_share: share of the roll-outs that begin at a measured state; the others begin as the task does.
+        episodes: that a policy is judged on, in the model and in the truth.
+    """
+
+    sampling: str = "ts1"
+    aleatoric: bool = True
+    data_share: float = 0.5
+    episodes: int = 100
+
+    def __post_init__(self) -> None:
+        if self.sampling not in SAMPLING:
+            hint = did_you_mean(self.sampling, list(SAMPLING))
+            raise ConfigError(f"control.sampling: got {self.sampling!r}; allowed are {', '.join(SAMPLING)}.{hint}")
+        if not 0 <= self.data_share <= 1:
+            raise ConfigError(f"control.data_share: got {self.data_share}; allowed is 0 to 1.")
+        check_at_least_one("control", self, ("episodes",))

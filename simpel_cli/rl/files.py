@@ -1,0 +1,72 @@
+"""A policy as files: weights as safetensors, a contract as JSON, and a runner that needs numpy and safetensors only."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from simpel_cli.encoding import Encoding
+from simpel_cli.errors import ConfigError
+from simpel_cli.records import replacing, write_text
+from simpel_cli.rl import runner
+from simpel_cli.rl.policy import Policy
+from simpel_cli.rl.task import Goal
+
+
+def contract(encoding: Encoding, goal: Goal, memory: int, dt: float) -> dict[str, Any]:
+    """Return what a rig has to know of a policy: observations, actions, their order, units and limits."""
+    return {
+        "format": "simpel policy 1",
+        "dt": dt,
+        "states": [{"name": q.name, "unit": q.unit, "angle": q.periodic} for q in encoding.states],
+        "commands": [
+            {"name": q.name, "unit": q.unit, "low": low, "high": high}
+            for q, low, high in zip(encoding.inputs, goal.low, goal.high, strict=True)
+        ],
+        "past_commands": memory,
+        "observation": "every state in order, an angle as its sine and cosine; then the past commands, oldest first",
+        "action": "tanh of the first half of the network's outputs, from [-1, 1] onto [low, high]",
+    }
+
+
+def save_policy(folder: Path, policy: Policy, facts: dict[str, Any]) -> None:
+    """Write a policy and the runner beside it.
+
+    Args:
+        folder: made if missing.
+        policy: one, not several.
+        facts: its contract.
+    """
+    from safetensors.numpy import save_file
+
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {"mean": policy.mean, "std": policy.std}
+    for i, (kernel, bias) in enumerate(policy.layers):
+        arrays |= {f"kernel_{i}": kernel, f"bias_{i}": bias}
+    with replacing(folder / "policy.safetensors") as temporary:
+        save_file({name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}, temporary)
+    write_text(folder / "policy.json", json.dumps(facts, indent=1))
+    shutil.copyfile(Path(runner.__file__), folder / "run_policy.py")
+
+
+def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
+    """Read a policy.
+
+    Raises:
+        ConfigError: it is missing or damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        facts = json.loads((folder / "policy.json").read_text())
+        arrays = {name: jnp.asarray(a) for name, a in load_file(folder / "policy.safetensors").items()}
+        layers = tuple(
+            (arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(sum(n.startswith("kernel_") for n in arrays))
+        )
+        return Policy(layers, arrays["mean"], arrays["std"]), facts
+    except (OSError, KeyError, ValueError, SafetensorError) as error:
+        raise ConfigError(f"{folder}: holds no policy ({type(error).__name__}: {error}).") from error

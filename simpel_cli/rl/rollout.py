@@ -1,0 +1,72 @@
+"""Episodes of a deterministic policy in a world: what it earns, where it ends."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from simpel_cli.rl.world import World
+
+
+class Episodes(NamedTuple):
+    """B episodes of T steps.
+
+    Args:
+        encoded: states, the initial one first.
+        seen: observations that the policy acted on.
+        action: in [-1, 1], clipped.
+        reward: of every step; 0 after the end.
+        good: whether the state was where it should be.
+        lived: steps that count.
+        broken: whether the world could not go on.
+    """
+
+    encoded: Float[Array, "T1 B de"]
+    seen: Float[Array, "T B do"]
+    action: Float[Array, "T B du"]
+    reward: Float[Array, "T B"]
+    good: Bool[Array, "T B"]
+    lived: Bool[Array, "T B"]
+    broken: Bool[Array, " B"]
+
+    @property
+    def returns(self) -> Float[Array, " B"]:
+        """Sum of the rewards."""
+        return jnp.sum(self.reward, axis=0)
+
+    def succeeded(self, settled: int) -> Bool[Array, " B"]:
+        """Whether the state was where it should be in the last steps."""
+        return jnp.all(self.good[-settled:] & self.lived[-settled:], axis=0)
+
+
+def episodes(
+    world: World,
+    act: Callable[[Float[Array, "B do"]], Float[Array, "B du"]],
+    key: PRNGKeyArray,
+    number: int,
+    horizon: int,
+) -> Episodes:
+    """Run B episodes; traceable. An episode that ended stays where it is and earns nothing."""
+    key_reset, key_steps = jax.random.split(key)
+    first = world.reset(key_reset, number)
+
+    def one(carry: Any, key: PRNGKeyArray) -> Any:
+        situation, alive, broken = carry
+        key_see, key_step = jax.random.split(key)
+        seen = world.observe(key_see, situation)
+        action = jnp.clip(act(seen), -1.0, 1.0)
+        after = world.step(key_step, situation, action)
+        reward = jnp.where(alive, after.judged.reward, 0.0)
+        kept = jax.tree.map(
+            lambda a, b: jnp.where(alive.reshape(number, *[1] * (a.ndim - 1)), a, b), after.situation, situation
+        )
+        row = (kept.encoded, seen, action, reward, after.judged.good & alive, alive)
+        return (kept, alive & ~after.judged.over, broken | (after.broken & alive)), row
+
+    start = (first, jnp.ones(number, bool), jnp.zeros(number, bool))
+    (_, _, broken), (encoded, *rest) = jax.lax.scan(one, start, jax.random.split(key_steps, horizon))
+    seen, action, reward, good, lived = rest
+    states = jnp.concatenate([first.encoded[None], encoded])
+    return Episodes(states, seen, action, reward, good, lived, broken)
