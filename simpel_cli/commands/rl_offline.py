@@ -154,11 +154,11 @@ def _publish(
         cells = [str(seed), f"{flown.model_returns[i]:.4g}"]
         if judged is not None:
             own = _of_run(judged, i)
-            returns = np.asarray(own.returns)
-            half = 1.96 * returns.std(ddof=1) / len(returns) ** 0.5
+            returns = np.asarray(own.returns, float)
+            mean, half = float(returns.mean()), 1.96 * float(returns.std(ddof=1)) / len(returns) ** 0.5
             ends = np.quantile(returns, [0.05, 0.95])
             cells += [
-                with_interval(returns.mean(), returns.mean() - half, returns.mean() + half),
+                with_interval(mean, mean - half, mean + half),
                 f"{ends[0]:.4g} to {ends[1]:.4g}",
                 f"{100 * float(np.mean(own.succeeded(asked.task.settled))):.0f} %" if asked.task.success else "-",
             ]

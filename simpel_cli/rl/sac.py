@@ -24,6 +24,7 @@ from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Replay, Transitions
 from simpel_cli.rl.world import Situation, World
 
+FLOAT32 = jnp.dtype("float32")
 LEAST_STD = 1e-3  # of an observation, in its unit: what never changes tells nothing
 
 
@@ -87,6 +88,9 @@ class Rule(NamedTuple):
     draw: Callable[[PRNGKeyArray, State], None]
     step: Callable[[PRNGKeyArray, State, None], tuple[State, Info]]
     policy: Callable[[State], Policy]
+    values: Callable[
+        [State, Float[Array, "b do"], Float[Array, "b du"]], Float[Array, "2 b"]
+    ]  # of normalised observations
     actor: Actor
 
 
@@ -157,7 +161,7 @@ class SAC:
         """Return the number of iterations that make up `steps`, at least one."""
         return max(1, round(self.steps / (self.side_by_side(multiple) * self.collect)))
 
-    def bind(self, world: World, horizon: int, dim_u: int, dtype: jnp.dtype = jnp.float32) -> Rule:
+    def bind(self, world: World, horizon: int, dim_u: int, dtype: jnp.dtype = FLOAT32) -> Rule:
         """Return the training on a world; called while tracing.
 
         Args:
@@ -256,7 +260,7 @@ class SAC:
             (situation, age, seen), rows, broken = collected(key_collect, state)
             scaler, replay = state.scaler.add(rows.seen), memory.put(state.replay, rows)
             found = memory.batches(key_batch, replay, rounds, self.batch)
-            shift, scale = scaler.mean, scaler.std
+            shift, scale = scaler.mean[None, None], scaler.std[None, None]
             found = found._replace(
                 seen=(found.seen - shift) / scale, then=(found.then - shift) / scale,
                 reward=found.reward * self.reward_scale,
@@ -282,4 +286,7 @@ class SAC:
         def policy(state: State) -> Policy:
             return Policy(to_actor(state.weights.actor), state.scaler.mean, state.scaler.std)
 
-        return Rule(init, lambda key, state: None, step, policy, actor)
+        def worth(state: State, seen: Float[Array, "b do"], action: Float[Array, "b du"]) -> Float[Array, "2 b"]:
+            return values(state.weights.critics, jnp.concatenate([seen, action], 1))
+
+        return Rule(init, lambda key, state: None, step, policy, worth, actor)

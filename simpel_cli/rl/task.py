@@ -49,10 +49,15 @@ class Goal(NamedTuple):
     low: tuple[float, ...]
     high: tuple[float, ...]
 
-    def command(self, action: Float[Array, "*b du"]) -> Float[Array, "*b du"]:
+    def command(self, action: Float[Array, "B du"]) -> Float[Array, "B du"]:
         """Return commands in physical units of actions in [-1, 1], which are clipped to that."""
-        low, high = (jnp.asarray(ends, action.dtype) for ends in (self.low, self.high))
+        low, high = (jnp.asarray(ends, action.dtype)[None] for ends in (self.low, self.high))
         return low + (high - low) * (jnp.clip(action, -1.0, 1.0) + 1) / 2
+
+    @property
+    def rest(self) -> tuple[float, ...]:
+        """Commands that nobody gave: the nearest to nothing that is allowed."""
+        return tuple(min(max(0.0, low), high) for low, high in zip(self.low, self.high, strict=True))
 
 
 @dataclass(frozen=True)

@@ -82,9 +82,8 @@ def world_of(
 
     def reset(key: PRNGKeyArray, n: int) -> Situation:
         encoded = encoding.encode(goal.start(key, n))
-        # commands that nobody gave are the nearest to nothing that is allowed
-        rest = jnp.clip(jnp.zeros(dim_u, encoded.dtype), jnp.asarray(goal.low), jnp.asarray(goal.high))
-        return Situation(encoded, jnp.broadcast_to(rest.astype(encoded.dtype), (n, memory, dim_u)))
+        rest = jnp.asarray(goal.rest, encoded.dtype)
+        return Situation(encoded, jnp.broadcast_to(rest[None, None], (n, memory, dim_u)))
 
     def observe(key: PRNGKeyArray, situation: Situation) -> Float[Array, "B do"]:
         seen = situation.encoded
@@ -95,17 +94,17 @@ def world_of(
         return jnp.concatenate([seen, situation.past.reshape(len(seen), -1)], axis=1)
 
     def step(key: PRNGKeyArray, situation: Situation, action: Float[Array, "B du"]) -> Step:
-        command = goal.command(action)
+        command = goal.command(action.astype(situation.encoded.dtype))
         n = len(command)
         stacked = jnp.concatenate([situation.past[:, memory - encoding.stack :], command[:, None]], axis=1)
         x = jnp.concatenate([situation.encoded, stacked.reshape(n, -1)], axis=1)
-        after = encoding.advance(situation.encoded, follow(key, x))
+        after = encoding.advance(situation.encoded, follow(key, x).astype(x.dtype))
         before = situation.past[:, -1] if memory else command
         judged = goal.judge(encoding.decode(after), command, before)
         broken = ~(jnp.isfinite(after).all(axis=1) & jnp.isfinite(judged.reward))
         past = jnp.concatenate([situation.past, command[:, None]], axis=1)[:, 1:] if memory else situation.past
         kept = Situation(jnp.where(broken[:, None], situation.encoded, after), past)
-        reward = jnp.where(broken, 0.0, judged.reward)
+        reward = jnp.where(broken, jnp.zeros_like(judged.reward), judged.reward)
         return Step(kept, judged._replace(reward=reward, over=judged.over | broken), broken)
 
     return World(reset, observe, step, memory, multiple)
@@ -117,7 +116,7 @@ def true_world(
     """Return the world of a simulator with known parameters and noisy sensors."""
 
     def follow(key: PRNGKeyArray, x: Float[Array, "B dx"]) -> Float[Array, "B dy"]:
-        return jax.vmap(one, in_axes=(0, None))(x, phi)
+        return jax.vmap(one, in_axes=(0, None))(x, phi.astype(x.dtype))
 
     return world_of(encoding, goal, follow, noise_std)
 
@@ -158,7 +157,7 @@ def learned_world(
         rolled = jnp.roll(x, turn, axis=0)
         y = members(rolled.reshape(particles, n // particles, -1)).reshape(n, -1)
         y = jnp.roll(y, -turn, axis=0)
-        return y + noise_std[None] * jax.random.normal(key_noise, y.shape, y.dtype) if aleatoric else y
+        return y + noise_std[None].astype(y.dtype) * jax.random.normal(key_noise, y.shape, y.dtype) if aleatoric else y
 
     return world_of(encoding, goal, follow, multiple=1 if sampling == "mean" else particles)
 
