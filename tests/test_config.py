@@ -59,7 +59,7 @@ def test_every_experiment_composes_and_builds(experiment: str, tmp_path: Path) -
     path = CONF / "experiment" / f"{experiment}.yaml"
     lines = path.read_text().splitlines()
     assert lines[0] == "# @package _global_"
-    assert re.match(rf"# simpel \w+ experiment={experiment}\b", lines[1]), "the second line is the command"
+    assert re.match(rf"# simpel [\w-]+ experiment={experiment}\b", lines[1]), "the second line is the command"
     verb = lines[1].split()[2]
     config = compose(tmp_path, verb, f"experiment={experiment}")
     assert config["run"]["name"] == experiment
