@@ -95,8 +95,10 @@ lock: ## Write uv.lock against the public index only
 	env -u UV_DEFAULT_INDEX -u UV_INDEX_URL -u UV_INDEX -u UV_EXTRA_INDEX_URL -u UV_FIND_LINKS -u PIP_INDEX_URL $(UV) lock --no-config
 
 data: install ## Make the measurements in data/ anew
-	rm -rf data/pendulum data/racecar data/greenhouse data/sergio data/hidden_pendulum data/hidden_cart
+	rm -rf data/pendulum data/racecar data/greenhouse data/sergio data/hidden_pendulum data/hidden_cart data/parking data/pendulum_swing_up
 	$(BIN)/simpel simulate simulation=pendulum out=data/pendulum
+	$(BIN)/simpel simulate sim=pendulum_high_fidelity simulation=pendulum_swing_up out=data/pendulum_swing_up
+	$(BIN)/simpel simulate sim=parking_car simulation=parking out=data/parking
 	for system in racecar greenhouse sergio; do \
 		$(BIN)/simpel simulate sim=$${system}_high_fidelity simulation=$$system out=data/$$system || exit; done
 	$(BIN)/simpel simulate $(EXAM) sim=mujoco_pendulum simulation=hidden_pendulum out=data/hidden_pendulum

@@ -1,5 +1,6 @@
 """Tasks, worlds and soft actor-critic against known values; the control verb from end to end."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -436,6 +437,12 @@ def test_the_runner_needs_no_jax(flown: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=flown, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "'u':" in done.stdout
+    states = '{"phi": 3.0, "omega": 0.1}\n\n{"phi": 3.0, "omega": 0.1}\n'
+    lines = subprocess.run(
+        [sys.executable, "policy/run_policy.py"], cwd=flown, input=states, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert len(lines) == 2
+    assert abs(json.loads(lines[0])["u"] - ast.literal_eval(done.stdout)["u"]) < 1e-12
 
 
 def test_a_fit_takes_the_experiment_of_a_task(tmp_path: Path) -> None:

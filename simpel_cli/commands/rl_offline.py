@@ -172,7 +172,7 @@ def _publish(
         )
     images = draw_control(directory, asked.task.horizon) if study.settings.figures else []
     commands = [
-        f"python {directory / 'policy' / 'run_policy.py'}          # numpy and safetensors only: see its first lines",
+        f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed",
         f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
     ]
     note = (

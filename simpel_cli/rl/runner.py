@@ -3,9 +3,14 @@
 runner = PolicyRunner("policy")
 command = runner.command({"phi": 3.1, "omega": 0.0})     # every dt seconds; a dict of commands in physical units
 runner.reset()                                           # at the start of every episode
+
+As a program it reads a JSON object of states per line and answers with one of commands; an empty line starts a new episode:
+
+    python run_policy.py < states.jsonl
 """
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -61,3 +66,17 @@ class PolicyRunner:
         if self.past:
             self.past = [*self.past[1:], value]
         return {c["name"]: float(v) for c, v in zip(self.facts["commands"], value, strict=True)}
+
+
+def main() -> None:
+    """Answer states on standard input with commands on standard output."""
+    runner = PolicyRunner(Path(__file__).parent)
+    for line in sys.stdin:
+        if line.strip():
+            print(json.dumps(runner.command(json.loads(line))), flush=True)
+        else:
+            runner.reset()
+
+
+if __name__ == "__main__":
+    main()
