@@ -73,7 +73,8 @@ def main() -> None:
     runner = PolicyRunner(Path(__file__).parent)
     for line in sys.stdin:
         if line.strip():
-            print(json.dumps(runner.command(json.loads(line))), flush=True)
+            sys.stdout.write(json.dumps(runner.command(json.loads(line))) + "\n")
+            sys.stdout.flush()
         else:
             runner.reset()
 

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.control [--seeds 3] [--steps 500000]
 
-The ceiling is that of trajectory optimisation on the published equations: 150.5 over 200 steps, 50.5 over 100; that of this car,
-whose equations are corrected, is still to be measured. Trained one after the other, 20 looks, 256 episodes each,
+The ceiling is that of trajectory optimisation on the published equations: 150.5 over 200 steps, 50.5 over 100; that of this
+car, whose equations are corrected, is still to be measured. Trained one after the other, 20 looks, 256 episodes each,
 deterministic; the best look counts.
 """
 
