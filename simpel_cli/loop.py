@@ -171,5 +171,5 @@ def _refuse_non_finite(info: Any, start: int) -> None:
         saved = f"the last good checkpoint is that of step {start}" if start else "there is no checkpoint yet"
         raise NumericsError(
             f"step {start + step + 1}: `{name}` is not finite (seed index {seed}); {saved}. "
-            "Try a smaller method.learning_rate, run.precision=float64, or narrower parameter ranges."
+            "Try a smaller method.learning_rate (of a policy: policy.learning_rate), run.precision=float64, or narrower ranges."
         )

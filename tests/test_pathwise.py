@@ -154,7 +154,7 @@ def test_networks_learn_the_paths() -> None:
     np.testing.assert_allclose(found.noise_std, NOISE, rtol=1e-3)
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.3])
+@pytest.mark.parametrize("noise", [0.02, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_the_noise_is_that_of_the_largest_marginal_likelihood(noise: float) -> None:
     x = np.random.default_rng(3).uniform(-EDGE, EDGE, (200, 1))
     problem = problem_of(noisy(noise, x), KAPPA, x)

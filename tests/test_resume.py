@@ -107,7 +107,7 @@ def test_interrupted_while_the_report_is_written(uninterrupted: Path, tmp_path: 
     assert (run / "report.html").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_interrupted(number: signal.Signals, uninterrupted: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     code, err = stop(tmp_path, run, (*FIT, "hydra.run.dir=run"), number, 0.0)
