@@ -4,8 +4,8 @@
 
 Trained one after the other, 20 looks at the same 256 episodes, deterministic; the best look counts. The ceiling is what
 trajectory optimisation reaches: from each of `--starts` initial states, without noise, the commands of all steps are
-optimised with the gradients of the simulator, beginning at what every trained policy does there and at disturbed copies; the best
-is taken. The share of the ceiling is that of the same initial states, without noise.
+optimised with the gradients of the simulator, beginning at what every trained policy does there and at disturbed copies; the
+best is taken. The share of the ceiling is that of the same initial states, without noise.
 """
 
 import argparse
