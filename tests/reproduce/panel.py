@@ -72,7 +72,7 @@ class Cell(NamedTuple):
 STEPS = {"greybox": "method.residual.steps", "sysid": None, "gp": None}  # where not method.steps; None: no network
 FSVGD = ("simpel", "simpel_only_sim", "simpel_high_fidelity", "fsvgd")
 WHERE = dict.fromkeys(FSVGD, "method.") | {"greybox": "method.residual."}
-# More points of the box than the defaults have, and fewer draws, for every prior over functions (docs/paper.md)
+# more points of the box than the defaults have, and fewer draws, at about the same cost, for every prior over functions
 POINTS = ("pool=1024", "sets=128")
 NEWTON = ("precondition=true", "fresh_points=32")
 DRAWS = dict.fromkeys(FSVGD[:3], 256) | {"pathwise": 512}
