@@ -31,8 +31,12 @@ $(STAMP): pyproject.toml uv.lock
 demo: install ## Run the main job (simpel fit experiment=pendulum) and say where the report lies
 	$(BIN)/simpel fit experiment=pendulum
 
+# most of the time of the tests is XLA's, for programs that run for a moment: 124 s became 92 in two files (cold cache, one core);
+# `make test-slow`, and pytest by itself, compile as users do
+QUICK := --xla_backend_optimization_level=1
+
 test: install ## Run the tests (under 12 minutes on two cores)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 test-slow: install ## Run the long studies that `make test` leaves out
 	$(BIN)/python -m pytest -m slow

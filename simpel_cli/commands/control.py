@@ -15,6 +15,7 @@ from simpel_cli.commands.checkpoint import keep, restored
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
 from simpel_cli.console import Terminal
+from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
 from simpel_cli.nodes import build
@@ -75,46 +76,43 @@ class Flown(NamedTuple):
     compile_seconds: float
 
 
-def assignment(config: dict[str, Any], learned: Learned, settings: Settings) -> Assignment:
-    """Build the groups of control.
+def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
+    """Build the groups of control, before anything is fitted.
 
     Raises:
         ConfigError: a key, or quantities of the truth that are not those of the simulator.
     """
     if not config.get("reward"):
         raise ConfigError("reward: missing; name a task, e.g. reward=parking, or an experiment that brings one.")
-    encoding = learned.study.system.encoding
-    if not encoding.states or encoding.outputs:
-        raise ConfigError(
-            f"sim: {learned.study.system.source.name} cannot be controlled in a learned model: every state has to be measured."
-        )
     task = build(config["reward"], "reward", settings.plugins, default=Task)
-    goal = task.bind(encoding)
     control = build(config.get("control") or {}, "control", default=Control)
     policy = build(config["policy"], "policy", settings.plugins, default=SAC)
+    source = source_of(config, settings)
+    if not source.states:
+        raise ConfigError(f"sim: {source.name} has no states, so that there is nothing to control.")
+    encoding = encoding_of(source, stack=int(config["data"].get("stack_actions") or 0))
+    goal = task.bind(encoding)
     truth, name = None, ""
     if config.get("truth"):
-        source = source_of({"sim": config["truth"]}, settings)
-        truth, name = _true_world(source, task, goal, encoding.stack, learned), source.name
+        true = source_of({"sim": config["truth"]}, settings)
+        truth, name = _true_world(true, task, goal, encoding), true.name
     return Assignment(task, goal, control, policy, truth, name)
 
 
-def _true_world(source: Any, task: Task, goal: Goal, stack: int, learned: Learned) -> World:
+def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
     if not isinstance(source, Model):
         raise ConfigError(
             f"truth: {source.name} answers queries only; name a simulator with equations, e.g. sim@truth=..."
         )
-    encoding = encoding_of(source, stack=stack)
-    own = learned.study.system.encoding
+    encoding = encoding_of(source, stack=own.stack)
     for what in ("states", "inputs"):
         have, need = ([q.name for q in getattr(e, what)] for e in (encoding, own))
         if have != need:
             raise ConfigError(
                 f"truth: {what} of {source.name} are {', '.join(have)}; those of sim are {', '.join(need)}."
             )
-    dtype = jnp.float32
-    phi = jnp.asarray([_middle(q) for q in source.params], dtype)
-    noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], dtype)
+    phi = jnp.asarray([_middle(q) for q in source.params], jnp.float32)
+    noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], jnp.float32)
     return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
 
 
@@ -131,6 +129,11 @@ def train(learned: Learned, asked: Assignment, terminal: Terminal, metrics: Metr
     study, fitted = learned.study, learned.fitted
     seeds, runs = study.settings.all_seeds, len(study.settings.all_seeds) * sac.policies
     encoding, dim_u = study.system.encoding, len(study.system.encoding.inputs)
+    if encoding.outputs:
+        measured = ", ".join(q.name for q in encoding.outputs)
+        raise ConfigError(
+            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
+        )
 
     def world_at(arrays: tuple[Problem, Any], share: float) -> World:
         problem, state = arrays

@@ -17,7 +17,7 @@ from simpel_cli.records import MetricStream, load_checkpoint, write_table, write
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.files import contract, save_policy
 from simpel_cli.rl.rollout import Episodes
-from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, stream
+from simpel_cli.run import Manifest, configure, make_directory, read_manifest, refuse_occupied, stream
 
 OWN = ("policy", "reward", "truth", "control")  # groups that a fit does not have
 
@@ -46,13 +46,15 @@ def resume(directory: Path) -> None:
 
 
 def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest) -> None:
+    settings = settings_of(config)
+    configure(settings)
+    asked = assignment(config, settings)  # what is wrong with the task is said before the fit
     fit = {key: value for key, value in config.items() if key not in OWN}
     model = learned(fit, directory / "posterior", data_folder)
     study = model.study
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet, directory / "run.log")
-    asked = assignment(config, model, study.settings)
     terminal.line()
     terminal.line(_task_line(asked), "task")
     constants = study.constants | {
