@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 LONGEST = (
     "wrong_inputs", "cli", "discover", "resume", "discovery_filter", "methods", "own_data", "recorded_systems", "scores",
     "discover_hopeless", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
+    "control", "pathwise",
 )  # fmt: skip
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs
 

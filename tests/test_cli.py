@@ -202,6 +202,7 @@ class TestFit:
             assert ours[key] == pytest.approx(alone[key], rel=0.05)
         assert load_file(tmp_path / "both" / "checkpoint" / "state.safetensors")["['state'].noise"].shape[0] == 2
 
+    @pytest.mark.slow
     def test_float64(self, tmp_path: Path) -> None:
         run(tmp_path, *FIT, "hydra.run.dir=run", "run.precision=float64")
         arrays = load_file(tmp_path / "run" / "checkpoint" / "state.safetensors")

@@ -428,7 +428,10 @@ EVERY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(EVERY))
+ALIKE = ("map", "repulsive")  # the class of fsvgd, with another velocity
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in EVERY])
 def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_zero(name: str) -> None:
     method, seeds = EVERY[name], 2
 

@@ -63,7 +63,7 @@ def test_a_ball_falls_along_a_parabola() -> None:
 
 
 @pytest.mark.parametrize(
-    "experiment", [pytest.param(e, marks=[pytest.mark.slow] if e == "rc_car" else []) for e in EXPERIMENTS]
+    "experiment", [pytest.param(e, marks=[] if e == "emps" else [pytest.mark.slow]) for e in EXPERIMENTS]
 )
 def test_experiment_runs_on_its_recording(
     experiment: str, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
