@@ -135,13 +135,19 @@ def train(program: Program, steps: int, *, state: Any = None, start: int = 0) ->
                 raise Interrupted(f"stopped at step {start} of {steps}; the state is saved.")
 
 
+_interruptions: list[threading.Event] = []  # of the main thread: none, or the one that is going on
+
+
 @contextmanager
 def interruption() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C or SIGTERM sets; a second Ctrl-C acts at once."""
-    event = threading.Event()
+    """Give an event that Ctrl-C or SIGTERM sets; a second Ctrl-C acts at once. Within another, gives that one's event."""
     if threading.current_thread() is not threading.main_thread():
-        yield event
+        yield threading.Event()
         return
+    if _interruptions:
+        yield _interruptions[0]
+        return
+    event = threading.Event()
 
     def note(number: int, frame: object) -> None:
         if event.is_set():
@@ -149,9 +155,11 @@ def interruption() -> Iterator[threading.Event]:
         event.set()
 
     before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    _interruptions.append(event)
     try:
         yield event
     finally:
+        _interruptions.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
 

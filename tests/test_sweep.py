@@ -54,6 +54,28 @@ class TestSweep:
         assert not (tmp_path / "sweep" / "3").exists()
         assert 0 in {row["seed"] for row in pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()}
 
+    def test_its_worker_ends_with_it(self, tmp_path: Path) -> None:
+        words = ("experiment=pendulum", *TINY, "run.seed=range(9)", "hydra.sweep.dir=sweep")
+        with start(tmp_path, "sweep", *words) as child:
+            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
+            worker = worker_of(child.pid)
+            child.kill()
+            child.communicate(timeout=PATIENCE)
+        end = time.monotonic() + PATIENCE
+        while is_running(worker):
+            assert time.monotonic() < end, "the worker goes on"
+            time.sleep(0.05)
+        assert not (tmp_path / "sweep" / "3").exists()
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process runs (one that ended and was not waited for does not)."""
+    state = Path(f"/proc/{pid}/stat")
+    try:
+        return state.read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
 
 def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120) -> None:
     end = time.monotonic() + seconds

@@ -6,7 +6,12 @@ that fails, or a worker that dies, costs that job only.
 
 import contextlib
 import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
 import traceback
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -49,8 +54,10 @@ class Jobs:
         quiet = job._replace(config=job.config | {"run": (job.config.get("run") or {}) | {"quiet": True}})
         began = perf_counter()
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-        future = self._pool.submit(_work, quiet)
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin)
+        with _without_ctrl_c():  # a new process inherits it, and is not stopped amid its imports
+            future = self._pool.submit(_work, quiet)
         try:
             outcome = future.result()
         except BrokenProcessPool:
@@ -108,12 +115,44 @@ def sweep(overrides: list[str], config_dir: Path | None, cfg: str | None) -> Non
         raise error
 
 
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Take no notice of Ctrl-C within."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _begin() -> None:
+    """Prepare the worker process: it stops with its parent, however that ends."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)  # amid a job: its state is saved first
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _leave_orphaned() -> None:
+    """End this process if nobody is left to give it jobs: it would wait for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None and not parent.is_alive():
+        os._exit(Interrupted.exit_code)
+
+
 def _work(job: Job) -> Outcome:
     """Fit in the worker process."""
     from simpel_cli.commands.fit import fit
+    from simpel_cli.loop import interruption
 
     try:
-        fit(job)
+        # Ctrl-C reaches this process too; an exception raised anywhere might be lost in a callback of a library
+        with interruption():
+            fit(job)
     except SimpelError as error:
         return Outcome(job.directory, error.exit_code, str(error))
     except Exception:  # whatever it is, it costs this job and no other; the traceback is kept beside it
@@ -121,6 +160,8 @@ def _work(job: Job) -> Outcome:
         job.directory.mkdir(parents=True, exist_ok=True)
         (job.directory / "traceback.txt").write_text(text)
         return Outcome(job.directory, 1, f"{text.splitlines()[-1]} (see traceback.txt in its directory)")
+    finally:
+        _leave_orphaned()
     return Outcome(job.directory, 0, "")
 
 

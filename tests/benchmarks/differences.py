@@ -44,7 +44,7 @@ DIFFERENCES = {
         ("discovery.rows=500", "discovery.horizon=15"), "slip of the tyres", ("tyre_slip on vx, vy, omega",)
     ),
     "greenhouse": Difference(
-        ("discovery.rows=400",),
+        ("discovery.rows=200", "discovery.beginnings=0"),
         "heating pipe (T_p with T_h and T_g), humidity (V with V_o; transpiration, condensation), latent heat (T_g)",
         ("input_exchange on T_p", "thermal_coupling on T_p", "input_exchange on V"),
     ),
