@@ -46,7 +46,7 @@ def recordings_dir() -> Path:
 
 CONTROL = ("rl-offline", "rl-online")
 # group -> key, of the verbs of control: an experiment brings them, there is no default
-BROUGHT = {"reward": "reward", "sim@truth": "truth"}
+BROUGHT = {"reward": "reward", "sim@truth": "truth", "sim@mujoco": "mujoco"}
 
 
 class Job(typing.NamedTuple):

@@ -10,8 +10,6 @@ from typing import Any
 
 from rich.console import Console
 
-LOG = logging.getLogger("simpel")
-
 
 class _Screen(Console):
     """A console whose reader may go away: `simpel fit | head` ends the printing, not the run."""
@@ -38,21 +36,17 @@ class Terminal:
         # a wide console when the output is a file or a pipe: lines are for grep, not for wrapping
         wide = sys.stdout is None or not sys.stdout.isatty()  # None: closed before the start (`simpel fit >&-`)
         self.console = _Screen(quiet=quiet, highlight=False, width=240 if wide else None)
-        LOG.setLevel(logging.INFO)
-        LOG.propagate = False
-        for handler in list(LOG.handlers):
-            handler.close()
-            LOG.removeHandler(handler)
+        self._log = logging.Logger("simpel", logging.INFO)  # its own: a verb may run another one, with a log of its own
         handler = logging.FileHandler(log) if log is not None else logging.NullHandler()
         handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-        LOG.addHandler(handler)
+        self._log.addHandler(handler)
 
     def line(self, text: str = "", label: str = "", style: str = "") -> None:
         """Print a line, with a label in its own column."""
         shown = f"{label:<10}{text}" if label else text
         self.console.print(shown, style=style, markup=False, soft_wrap=True)
         if shown:
-            LOG.info(shown)
+            self._log.info(shown)
 
     @contextmanager
     def progress(self, label: str, total: int, start: int) -> Iterator[Any]:

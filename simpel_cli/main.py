@@ -165,6 +165,31 @@ def rl_offline(
         _launch("rl-offline", task, overrides, config_dir, cfg)
 
 
+@app.command("rl-online")
+def rl_online(
+    overrides: Overrides = None,
+    config_dir: ConfigDir = None,
+    cfg: Cfg = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on with an interrupted run.")] = None,
+) -> None:
+    """Act, measure, learn a model and a policy, act again, without data to begin with.
+
+    Examples:
+      simpel rl-online experiment=rc_car_parking online.episodes=10
+
+      simpel rl-online --config-dir my sim=rig reward=my_task world=folder:exchange
+    """
+    if resume is not None:
+        _refuse_more(resume, overrides, config_dir, cfg)
+        from simpel_cli.commands.rl_online import resume as go_on
+
+        go_on(resume)
+    else:
+        from simpel_cli.commands.rl_online import rl_online as task
+
+        _launch("rl-online", task, overrides, config_dir, cfg)
+
+
 @app.command()
 def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
     """Fit every combination of values and collect the results.

@@ -18,7 +18,7 @@ from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
-from simpel_cli.likeliest import noise_of_smooth
+from simpel_cli.likeliest import TYPICAL_SCALE, noise_of_smooth
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
 from simpel_cli.transition import Transition, encoding_of, transition
 from simulators.model import Model
@@ -178,18 +178,20 @@ def assemble(
     noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma, declared))
     problems, scales = [], []
     for (x, y), key in zip(training, keys, strict=True):
-        length = padded_length(len(x))
+        m, length = len(x), padded_length(max(len(x), 1))
+        if m == 0:  # what pads must be simulable
+            x, y = np.asarray(normaliser.x_mean)[None], np.asarray(normaliser.y_mean)[None]
         targets = (y - normaliser.y_mean) / normaliser.y_std
         key_scale, key_bank = jax.random.split(key)
         scale, sigma = _scales(
-            prior, bound, system, normaliser, x, targets, noise_init, key_scale,
+            prior, bound, system, normaliser, x[:m], targets[:m], noise_init, key_scale,
             # of more rows than are looked at networks learn the noise better than those tell it
-            with_noise=noise.learn and noise.marginal_share > 0 and len(x) <= _most_rows(prior, system),
+            with_noise=noise.learn and noise.marginal_share > 0 and m <= _most_rows(prior, system),
         )  # fmt: skip
         arrays = Problem(
             x=pad_rows(x, length),
             y=pad_rows(targets, length),
-            m=np.array(len(x), np.int32),
+            m=np.array(m, np.int32),
             normaliser=normaliser,
             gap_scale=scale,
             noise_init=noise_init,
@@ -259,6 +261,8 @@ def _scales(
         given = given + (np.nan if isinstance(gap.scale, str) else gap.scale)
         if gap.scale == "declared":
             given = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
+    if len(x) == 0:  # nothing to choose by
+        return np.where(np.isnan(given), TYPICAL_SCALE, given), np.zeros(size)
     if not (np.isnan(given).any() or with_noise):
         return given, np.zeros(size)
     subset: slice | np.ndarray = slice(None)

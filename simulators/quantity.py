@@ -33,6 +33,11 @@ class Quantity(NamedTuple):
     periodic: bool = False
     prior: str = "uniform"
 
+    @property
+    def middle(self) -> float:
+        """Middle of the range, of a lognormal one the geometric."""
+        return float((self.low * self.high) ** 0.5 if self.prior == "lognormal" else (self.low + self.high) / 2)
+
 
 def check_model_name(name: Any) -> None:
     """Refuse what CasADi cannot call a function."""

@@ -28,7 +28,7 @@ from simpel_cli.rl.task import Goal, Task
 from simpel_cli.rl.world import World, beginning_at, learned_world, true_world
 from simpel_cli.run import Settings, stream
 from simpel_cli.transition import encoding_of, transition
-from simulators.model import Model, Quantity
+from simulators.model import Model
 
 Judge = Callable[[Policy, PRNGKeyArray], Episodes]  # leaves of the policy (runs, ...)
 
@@ -38,6 +38,7 @@ class Assignment(NamedTuple):
 
     Args:
         task: as declared.
+        encoding: of the simulator's quantities.
         goal: bound to the quantities.
         control: how the policy meets the model.
         policy: how it learns.
@@ -46,11 +47,17 @@ class Assignment(NamedTuple):
     """
 
     task: Task
+    encoding: Encoding
     goal: Goal
     control: Control
     policy: SAC
     truth: World | None
     truth_name: str
+
+    @property
+    def memory(self) -> int:
+        """Past commands that a policy sees."""
+        return max(self.encoding.stack, int(self.goal.uses_before))
 
 
 class Best(NamedTuple):
@@ -96,7 +103,7 @@ def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
     if config.get("truth"):
         true = source_of({"sim": config["truth"]}, settings)
         truth, name = _true_world(true, task, goal, encoding), true.name
-    return Assignment(task, goal, control, policy, truth, name)
+    return Assignment(task, encoding, goal, control, policy, truth, name)
 
 
 def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
@@ -111,19 +118,33 @@ def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
             raise ConfigError(
                 f"truth: {what} of {source.name} are {', '.join(have)}; those of sim are {', '.join(need)}."
             )
-    phi = jnp.asarray([_middle(q) for q in source.params], jnp.float32)
+    phi = jnp.asarray([q.middle for q in source.params], jnp.float32)
     noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], jnp.float32)
     return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
 
 
-def _middle(q: Quantity) -> float:
-    return (q.low * q.high) ** 0.5 if q.prior == "lognormal" else (q.low + q.high) / 2
-
-
-def train(learned: Learned, asked: Assignment, terminal: Terminal, metrics: MetricStream, directory: Path) -> Flown:
+def train(
+    learned: Learned,
+    asked: Assignment,
+    terminal: Terminal,
+    metrics: MetricStream,
+    directory: Path,
+    *,
+    label: str = "policy",
+    before: Path | None = None,
+) -> Flown:
     """Train policies in every seed's posterior; the best of each seed, by what it earns in the model, is kept.
 
     A checkpoint in the directory is gone on with.
+
+    Args:
+        learned: the posteriors.
+        asked: the task.
+        terminal: for a progress bar.
+        metrics: for learning curves.
+        directory: of the checkpoint.
+        label: of the progress bar.
+        before: directory of a training on another posterior, whose policies and critics this one begins with.
     """
     sac, control, task = asked.policy, asked.control, asked.task
     study, fitted = learned.study, learned.fitted
@@ -169,14 +190,20 @@ def train(learned: Learned, asked: Assignment, terminal: Terminal, metrics: Metr
 
     program = loop.compiled(bind, problems, keys, stretch)
     shape = loop.state_shape(bind, problems, keys)
+
+    def empty() -> Any:
+        return jax.eval_shape(lambda p, s: Best(policies_of(p, s), jnp.zeros(runs, jnp.float32)), problems, shape)
+
     start, state, best = 0, None, None
     if (directory / "checkpoint" / "state.safetensors").exists():
-        empty = jax.eval_shape(lambda p, s: Best(policies_of(p, s), jnp.zeros(runs, jnp.float32)), problems, shape)
-        (state, best), facts = restored(directory, (shape, empty))
+        (state, best), facts = restored(directory, (shape, empty()))
         start = int(facts["step"])
+    elif before is not None:
+        (last, _), _ = restored(before, (shape, empty()))
+        state = sac.begun_with(program.init(problems, keys), last)
     began = time.perf_counter()
     per = sac.side_by_side(multiple) * sac.collect
-    with terminal.progress("policy", iterations, start) as update:
+    with terminal.progress(label, iterations, start) as update:
         for one in loop.train(program, iterations, state=state, start=start):
             now = policies_of(problems, one.state)
             earned, broken = model_judge(problems, now, stream(0, "judge"))

@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.commands.close import close, memory_of
 from simpel_cli.commands.discover_show import publish
-from simpel_cli.commands.study import open_study, resolved, settings_of
+from simpel_cli.commands.study import open_study, refuse_untested, resolved, settings_of
 from simpel_cli.config import Job, dump
 from simpel_cli.console import Terminal
 from simpel_cli.discovery.assess import Assessor
@@ -77,6 +77,7 @@ def effects_of(node: Mapping[str, Any] | None, plugins: tuple[str, ...]) -> list
 def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest) -> dict[str, Any]:
     began = time.perf_counter()
     study = open_study(config, data_folder, whole=False)
+    refuse_untested(study.recording)
     manifest.add_inputs(study.recording.files)
     model = study.system.source
     if not isinstance(model, Model):

@@ -102,6 +102,12 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
             "train_seconds": round(time.perf_counter() - began, 3),
             "n_train": len(fitted.training[0][0]),
         }
+        if not study.recording.test:
+            metrics.close()
+            terminal.line(
+                f"nothing was kept to judge on; simpel evaluate {directory} data=NAME judges on other measurements"
+            )
+            return Learned(study, fitted, state)
         found = posteriors(study, fitted, state)
         judged: Judged = judge(study, found, fitted.target_std, directory, study.method.steps)
         metrics.add(judged.rows)

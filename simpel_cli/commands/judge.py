@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli import evaluation as ev
-from simpel_cli.commands.study import Study
+from simpel_cli.commands.study import Study, refuse_untested
 from simpel_cli.data import Episode, Places, origins, places, transitions
 from simpel_cli.encoding import Encoding
 from simpel_cli.records import write_table
@@ -40,6 +40,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     encoding, dt = study.system.encoding, study.system.source.dt
     horizon = study.evaluation.steps(dt)
     episodes = study.recording.test
+    refuse_untested(study.recording)
     pairs = transitions(episodes, encoding.stack)
     x, y = ev.test_arrays(pairs, encoding)
     where = _places(study, episodes, pairs.episode, pairs.row)

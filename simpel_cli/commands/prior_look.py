@@ -11,7 +11,7 @@ from simpel_cli.run import stream
 
 def look_at_prior(study: Study, fitted: Fitted) -> PriorCheck | None:
     """Compare the training targets of the first seed with draws of the prior; None where there is nothing to compare."""
-    if not study.prior.uses_simulator:
+    if not study.prior.uses_simulator or len(fitted.training[0][0]) == 0:
         return None
     problem = jax.tree.map(lambda a: np.asarray(a[0]), fitted.assembled.problems)
     x, y = fitted.training[0]

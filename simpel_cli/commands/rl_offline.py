@@ -19,7 +19,7 @@ from simpel_cli.rl.files import contract, save_policy
 from simpel_cli.rl.rollout import Episodes
 from simpel_cli.run import Manifest, configure, make_directory, read_manifest, refuse_occupied, stream
 
-OWN = ("policy", "reward", "truth", "control")  # groups that a fit does not have
+OWN = ("policy", "reward", "truth", "mujoco", "control", "online", "world")  # groups that a fit does not have
 
 
 def rl_offline(job: Job) -> None:
@@ -69,13 +69,18 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         judged = _judged(model, asked, flown, directory)
         metrics.add(_rows(study.settings.all_seeds, asked, flown, judged))
         metrics.close()
-    memory = asked.truth.memory if asked.truth is not None else study.system.encoding.stack
-    facts = contract(study.system.encoding, asked.goal, memory, study.system.source.dt)
+    saved_policies(directory, model, asked, flown)
+    _publish(config, terminal, model, asked, flown, judged, directory)
+
+
+def saved_policies(directory: Path, model: Learned, asked: Assignment, flown: Flown) -> None:
+    """Write the policies of every seed; that of the seed with the largest return in the model as `policy`."""
+    study = model.study
+    facts = contract(study.system.encoding, asked.goal, asked.memory, study.system.source.dt)
     best = int(np.argmax(flown.model_returns))
     for i, seed in enumerate(study.settings.all_seeds):
         folder = directory / "policy" if i == best else directory / f"policy_seed_{seed}"
         save_policy(folder, _of_run(flown.policies, i), facts)
-    _publish(config, terminal, model, asked, flown, judged, directory)
 
 
 def _done_steps(directory: Path) -> int | None:

@@ -54,6 +54,9 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
 def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
     """Say which file was read, what of it is used, and what to look at."""
     failed = [c for c in recording.checks if not c.ok]
+    if not recording.files:
+        terminal.line("no measurements: the posterior is the prior", "data")
+        return
     terminal.line(
         f"{recording.files[0]}   {used}   checks {len(recording.checks) - len(failed)} ok"
         + (f", {len(failed)} to look at" if failed else ""),

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from simpel_cli.config import Job
-from simpel_cli.data import Measurements, Recording, absolute, read, select, transitions
-from simpel_cli.errors import ConfigError, did_you_mean
+from simpel_cli.data import Measurements, Recording, absolute, no_transitions, read, select, transitions
+from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
 from simpel_cli.nodes import build
@@ -23,7 +23,7 @@ from simpel_cli.run import Settings, configure, stream
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
 GROUPS = (
     "run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery", "policy", "control",
-    "reward", "truth",
+    "reward", "truth", "mujoco", "online",
 )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ class Study(NamedTuple):
 def settings_of(config: dict[str, Any]) -> Settings:
     """Build the `run:` group and refuse keys that no verb has."""
     for key in config:
-        if key not in (*GROUPS, "choices", "run_dir", "out", "close", "report"):
+        if key not in (*GROUPS, "choices", "run_dir", "out", "close", "report", "world"):
             raise ConfigError(f"{key}: no such key.{did_you_mean(key, list(GROUPS))} (groups: {', '.join(GROUPS)})")
     return build(config.get("run") or {}, "run", default=Settings)
 
@@ -125,6 +125,19 @@ def resolved(job: Job) -> dict[str, Any]:
     return config
 
 
+def refuse_untested(recording: Recording) -> None:
+    """Refuse measurements of which nothing is kept to test on.
+
+    Raises:
+        DataError: with the cure.
+    """
+    if not recording.test:
+        raise DataError(
+            "nothing is kept to judge on (data.split.test_fraction is 0, or there are no measurements). Keep some, or name "
+            "others: simpel evaluate RUN_DIR data=NAME."
+        )
+
+
 class Fitted(NamedTuple):
     """A rule bound to the training transitions of every seed."""
 
@@ -144,7 +157,9 @@ class Fitted(NamedTuple):
 def prepare(study: Study) -> Fitted:
     """Choose the training transitions of every seed and assemble the problems."""
     settings, measurements = study.settings, study.measurements
-    pairs = transitions(study.recording.train, measurements.stack_actions)
+    source, stack = study.system.source, measurements.stack_actions
+    recorded = study.recording.train
+    pairs = transitions(recorded, stack) if recorded else no_transitions(source, len(study.recording.outputs), stack)
     training = [
         test_arrays(
             select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding

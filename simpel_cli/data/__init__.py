@@ -3,10 +3,10 @@
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.files import absolute
 from simpel_cli.data.reader import read
-from simpel_cli.data.recording import Check, Episode, Recording, Transitions, select, transitions
+from simpel_cli.data.recording import Check, Episode, Recording, Transitions, no_transitions, select, transitions
 from simpel_cli.data.segments import Places, origins, places
 
 __all__ = [
-    "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "absolute", "origins", "places", "read",
-    "select", "transitions",
+    "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "absolute", "no_transitions", "origins",
+    "places", "read", "select", "transitions",
 ]  # fmt: skip

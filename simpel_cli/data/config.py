@@ -17,22 +17,24 @@ class Measurements:
     """Files of measurements and how they map onto a simulator.
 
     Args:
-        path: a .parquet or .csv file, or a list of them with the same columns; relative paths are tried against the
-            config file's folder, then the working one. An episode never runs on from one file into the next: where
-            their names are the same in two files, or none are given, they are called by the file's name.
+        path: a .parquet or .csv file, or a list of them with the same columns (an empty one: nothing was measured);
+            relative paths are tried against the config file's folder, then the working one. An episode never runs on
+            from one file into the next: where their names are the same in two files, or none are given, they are called
+            by the file's name.
         time: column of the time, s. Without it, a row is one `dt` of the simulator.
         episode: column that names the episode of a row. Without it, the file is one episode.
         columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
         computed: new column -> formula in columns of the file, e.g. `{v: vx*cos(theta) + vy*sin(theta)}`.
         split: `{column: name}` with the values train and test (other values are left out and counted), or
             `{test_files: [test.csv]}`: these of the files in `path` to test on, the others to train on, or
-            `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode. A single
+            `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode; 0: all is
+            trained on and nothing judged. A single
             episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
             at the simulator's dt and is estimated where absent.
         resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.
         layout: `trajectories` (rows follow each other) or `transitions` (next values in `next_<state column>`).
-        n_train: number of training transitions to use; null = all.
+        n_train: number of training transitions to use; null = all, 0 = none: the posterior is the prior.
         choice: which ones: `random` (seeded; the smaller set is part of the larger one) or `first`.
         seed: of the split and of the choice; null = the run's seed.
         n_episodes: use the first so many training episodes; null = all.
@@ -67,13 +69,13 @@ class Measurements:
     derived: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.paths or not all(isinstance(path, str) and path for path in self.paths):
+        if not all(isinstance(path, str) and path for path in self.paths):
             raise ConfigError(f"data.path: {self.path!r} is not allowed, only the name of a file or a list of names.")
         _one_of("layout", self.layout, LAYOUTS)
         _one_of("choice", self.choice, CHOICES)
         _positive("resample", self.resample)
         _positive("max_gap", self.max_gap)
-        _whole("n_train", self.n_train, 1)
+        _whole("n_train", self.n_train, 0)
         _whole("n_episodes", self.n_episodes, 1)
         _whole("seed", self.seed, 0)
         _whole("stack_actions", self.stack_actions, 0)
@@ -93,6 +95,11 @@ class Measurements:
             raise ConfigError(
                 "data.resample: the distance of the rows is not known. Name the column of the time: data.time: <name>."
             )
+
+    @property
+    def all_train(self) -> bool:
+        """Whether nothing is kept to test on."""
+        return not self.paths or self.split.get("test_fraction") == 0
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -165,6 +172,8 @@ def _check_split(split: Mapping[str, Any]) -> None:
             raise ConfigError(f"data.split.column: {split['column']!r} is not the name of a column.")
         return
     fraction = split.get("test_fraction", SPLIT_DEFAULT["test_fraction"])
-    if not (_is_number(fraction) and 0 < fraction < 1):
-        raise ConfigError(f"data.split.test_fraction: {fraction!r} is not allowed, only a number between 0 and 1.")
+    if not (_is_number(fraction) and 0 <= fraction < 1):
+        raise ConfigError(
+            f"data.split.test_fraction: {fraction!r} is not allowed, only a number from 0 up to, not with, 1."
+        )
     _one_of("split.by", split.get("by", SPLIT_DEFAULT["by"]), SPLIT_BY)

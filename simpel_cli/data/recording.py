@@ -72,11 +72,20 @@ def transitions(episodes: Sequence[Episode], stack_actions: int) -> Transitions:
     Raises:
         DataError: no episode is long enough.
     """
+    if not episodes:
+        raise DataError("no transition: there is no episode.")
     parts = [_of_episode(index, episode, stack_actions) for index, episode in enumerate(episodes)]
     joined = Transitions(*(np.concatenate(column) for column in zip(*parts, strict=True))) if parts else None
     if joined is None or len(joined.row) == 0:
         raise DataError(f"no transition: none of {len(parts)} episodes has {stack_actions + 2} rows in a row.")
     return joined
+
+
+def no_transitions(source: Source, outputs: int, stack_actions: int) -> Transitions:
+    """Return no transition at all, of a simulator with so many measured outputs."""
+    states, inputs = np.empty((0, len(source.states))), np.empty((0, (stack_actions + 1) * len(source.inputs)))
+    nothing = np.empty(0, int)
+    return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing)
 
 
 def _of_episode(index: int, episode: Episode, stack: int) -> Transitions:

@@ -28,6 +28,9 @@ def assign(config: Measurements, table: Table, rows: Rows, dynamic: bool, seed: 
     if "column" in config.split:
         label = split_labels(config, table, config.split["column"])[rows.number]
         _refuse_alternation(config.split["column"], rows, label, dynamic)
+    elif config.all_train:
+        label = np.full(len(rows.episode), "train")
+        detail = "everything is trained on, nothing is kept to test on"
     else:
         rule = SPLIT_DEFAULT | dict(config.split)
         fraction = float(rule["test_fraction"])
@@ -44,7 +47,7 @@ def assign(config: Measurements, table: Table, rows: Rows, dynamic: bool, seed: 
             label = _by_episode(rows, fraction, seed)
     left_out = int(np.sum(~np.isin(label, PARTS)))
     others = ", ".join(repr(str(v)) for v in np.unique(label) if v not in PARTS)
-    for part in PARTS:
+    for part in PARTS[: 1 if config.all_train else 2]:
         if not np.any(label == part):
             found = f" The split column has only {', '.join(repr(str(v)) for v in np.unique(label))}." if others else ""
             raise DataError(f"the {part} split is empty.{found} Values for use are 'train' and 'test' (data.split).")

@@ -88,7 +88,12 @@ class ExactGP:
             data = spectrum(gram(kernel, known, known), left, problem.m)
             prior_std = self.noise.prior_std if self.noise.learn else None
             best = likeliest(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
-            return State(phi, data, best.noise.astype(dtype), (jnp.sum(best.loss) / jnp.sum(counts)).astype(dtype))
+            return State(
+                phi,
+                data,
+                best.noise.astype(dtype),
+                (jnp.sum(best.loss) / jnp.maximum(jnp.sum(counts), 1)).astype(dtype),
+            )
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
             return state, Info(state.loss, state.noise_std, jnp.zeros((), dtype))

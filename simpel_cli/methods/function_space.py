@@ -181,7 +181,7 @@ class FunctionSpace(ABC):
             y = problem.y[batch]
             h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, x), state.particles)
 
-            weight = problem.m.astype(dtype) / jnp.sum(counted)
+            weight = problem.m.astype(dtype) / at_least_one(counted)
             fit, (score_data, score_noise) = jax.value_and_grad(
                 lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
             )(h[:, :b], state.noise)
@@ -189,15 +189,20 @@ class FunctionSpace(ABC):
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
             if prior_basis is not None:
-                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / problem.m.astype(dtype)
+                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / jnp.maximum(problem.m, 1).astype(dtype)
                 velocity = preconditioned(velocity, prior_basis, evenly, self.prior_weight)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)
-            info = Info(-fit / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            info = Info(-fit / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
             return after, info
 
         return Inference(networks.init, draw, step, networks.predict, networks.members)
+
+
+def at_least_one(counted: Float[Array, " b"]) -> Float[Array, ""]:
+    """Return how many rows count; of none, 1, so that what is divided by it is 0: the posterior of no data is the prior."""
+    return jnp.maximum(jnp.sum(counted), 1)
 
 
 def distinct_rows(key: PRNGKeyArray, size: int, m: Int[Array, ""]) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:

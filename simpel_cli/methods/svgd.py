@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.methods.fsvgd import refuse_bandwidth, stein_velocity
-from simpel_cli.methods.function_space import distinct_rows, log_likelihood
+from simpel_cli.methods.function_space import at_least_one, distinct_rows, log_likelihood
 from simpel_cli.methods.networks import Networks, State, refuse_rates
 from simpel_cli.nets import MLP, Particles
 
@@ -73,7 +73,7 @@ class SVGD:
             batch, is_data = distinct_rows(key, min(self.batch, n_rows), jnp.asarray(problem.m))
             counted = is_data.astype(dtype)
             x, y = to_normalised.x(jnp.asarray(problem.x)[batch]), jnp.asarray(problem.y)[batch]
-            weight = problem.m.astype(dtype) / jnp.sum(counted)
+            weight = problem.m.astype(dtype) / at_least_one(counted)
 
             def fit(particles: Particles, rho: Float[Array, " dy"]) -> Float[Array, ""]:
                 return log_likelihood(self.network.apply_all(particles, x), networks.noise_std(rho), y, counted)
@@ -84,7 +84,7 @@ class SVGD:
             flat, unflatten = _flattened(state.particles)
             velocity, mean_kernel = stein_velocity(flat, _flattened(score)[0], self.bandwidth)
             after = networks.ascended(state, unflatten(velocity), weight * slope_noise)
-            info = Info(-value / (jnp.sum(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            info = Info(-value / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
             return after, info
 
         return Inference(networks.init, lambda key, state: None, step, networks.predict, networks.members)

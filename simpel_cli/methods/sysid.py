@@ -159,7 +159,9 @@ class SysID:
                 (state, jnp.ones((), bool)),
             )
             best = jnp.argmin(after.loss)
-            info = Info(after.loss[best] / problem.m.astype(dtype), sigma(after.rho[best]), jnp.zeros((), dtype))
+            info = Info(
+                after.loss[best] / jnp.maximum(problem.m, 1).astype(dtype), sigma(after.rho[best]), jnp.zeros((), dtype)
+            )
             return after, info
 
         def drawn(state: State) -> tuple[Float[Array, "L dp"], Float[Array, " dy"]]:

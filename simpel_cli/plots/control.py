@@ -34,8 +34,63 @@ def draw_control(directory: Path, horizon: int) -> list[Path]:
         table, units = columns_of(path), units_of(path)
         made.append(save(_paths(table, units), directory / "trajectories.png"))
         if {"x", "y", "theta"} <= set(table):
-            _film(table, directory / "manoeuvre.gif")
+            _film(_median(table), directory / "manoeuvre.gif")
     return made
+
+
+def draw_online(directory: Path) -> list[Path]:
+    """Draw what the Parquet files of an online run tell: returns by episode, paths of the episodes, the last as a film."""
+    made = [save(_returns(read_metrics(directory / "metrics.parquet")), directory / "returns.png")]
+    files = sorted((directory / "episodes").glob("*.parquet"))
+    tables = [columns_of(path) for path in files]
+    made.append(save(_courses(tables, units_of(files[0])), directory / "trajectories.png"))
+    if {"x", "y", "theta"} <= set(tables[-1]):
+        _film({name: tables[-1][name] for name in ("x", "y", "theta")}, directory / "manoeuvre.gif")
+    return made
+
+
+def _returns(rows: list[dict[str, Any]]) -> Any:
+    figure, axes = new_figure(2, 4.2, 3.2)
+    for i, (metric, label) in enumerate((("return", "in the plant"), ("return_in_model", "in the model, beforehand"))):
+        line = [(r["step"], r["value"]) for r in rows if r["metric"] == metric]
+        axes[0].plot(*zip(*line, strict=True), color=COLOURS[i], marker="o", markersize=4, linewidth=1.2, label=label)
+    axes[0].set(title="return", xlabel="episode", ylabel="return")
+    legend_below(figure, axes[0])
+    line = [(r["step"], r["value"]) for r in rows if r["metric"] == "nll_before"]
+    axes[1].plot(*zip(*line, strict=True), color=COLOURS[2], marker="o", markersize=4, linewidth=1.2)
+    axes[1].set(title="NLL before it was learned", xlabel="episode", ylabel="nat")
+    for axis in axes:
+        axis.locator_params(axis="x", integer=True)
+    return figure
+
+
+def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
+    """Course of every episode, later ones darker, the last in colour."""
+    plane = {"x", "y"} <= set(units)
+    left_out = ("t", "reward", "good", *(("x", "y") if plane else ()))
+    names = [n for n in units if n not in left_out]
+    figure, axes = new_figure(len(names) + plane, columns=3)
+    for k, table in enumerate(tables):
+        last = k == len(tables) - 1
+        style = {
+            "color": COLOURS[1] if last else BLACK,
+            "alpha": 1.0 if last else 0.15 + 0.5 * k / len(tables),
+            "linewidth": 1.0,
+        }
+        label = "last episode" if last else "earlier ones, later darker" if k == 0 else None
+        if plane:
+            axes[0].plot(table["x"], table["y"], label=label, **style)
+        for axis, name in zip(axes[plane:], names, strict=True):
+            axis.plot(table["t"], table[name], label=None if plane else label, **style)
+    if plane:
+        axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
+        axes[0].set(title="paths", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]))
+        axes[0].set_aspect("equal", adjustable="datalim")
+    for axis, name in zip(axes[plane:], names, strict=True):
+        axis.set(title=name, xlabel=with_unit("t", "s"), ylabel=with_unit(name, units[name]))
+    if len(tables) > 1:
+        legend_below(figure, axes[0])
+    return figure
 
 
 def _curves(rows: list[dict[str, Any]]) -> Any:
@@ -77,17 +132,22 @@ def _paths(table: dict[str, np.ndarray], units: dict[str, str]) -> Any:
     return figure
 
 
-def _film(table: dict[str, np.ndarray], path: Path) -> None:
-    """Draw the episode of the median return as a car on the plane."""
-    from PIL import Image
-
+def _median(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the course of the first seed's episode of the median return."""
     first = table["seed"] == table["seed"][0]
     numbers = distinct(table["episode"][first])
     returns = [table["reward"][first & (table["episode"] == e)].sum() for e in numbers]
     median = numbers[int(np.argsort(returns)[len(returns) // 2])]
     own = first & (table["episode"] == median)
     order = np.argsort(table["step"][own])
-    x, y, theta = (table[name][own][order] for name in ("x", "y", "theta"))
+    return {name: table[name][own][order] for name in ("x", "y", "theta")}
+
+
+def _film(table: dict[str, np.ndarray], path: Path) -> None:
+    """Draw the course of x, y and theta as a car on the plane."""
+    from PIL import Image
+
+    x, y, theta = (table[name] for name in ("x", "y", "theta"))
     every = max(1, len(x) // FRAMES)
     figure, (axis,) = new_figure(1, 4.5, 4.0)
     margin = 0.5

@@ -161,6 +161,15 @@ class SAC:
         """Return the number of iterations that make up `steps`, at least one."""
         return max(1, round(self.steps / (self.side_by_side(multiple) * self.collect)))
 
+    def begun_with(self, fresh: State, last: State) -> State:
+        """Return the beginning of a training that goes on with what another one learned, with an empty memory.
+
+        Args:
+            fresh: a beginning.
+            last: the end of a training of the same shape.
+        """
+        return fresh._replace(weights=last.weights, targets=last.targets, scaler=last.scaler)
+
     def bind(self, world: World, horizon: int, dim_u: int, dtype: jnp.dtype = FLOAT32) -> Rule:
         """Return the training on a world; called while tracing.
 

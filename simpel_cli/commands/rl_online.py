@@ -1,0 +1,292 @@
+"""`simpel rl-online`: act in the plant, measure, learn a model and a policy, act again."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from simpel_cli import evaluation as ev
+from simpel_cli.commands.control import Assignment, Flown, assignment, train
+from simpel_cli.commands.fit import Learned, learned
+from simpel_cli.commands.rl_offline import OWN, saved_policies
+from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
+from simpel_cli.config import Job, dump, load
+from simpel_cli.console import Terminal
+from simpel_cli.data import Measurements, read, transitions
+from simpel_cli.errors import ConfigError, DataError, did_you_mean
+from simpel_cli.nodes import build
+from simpel_cli.plots.canvas import columns_of
+from simpel_cli.plots.control import draw_online
+from simpel_cli.records import MetricStream, load_checkpoint, read_metrics, write_metrics, write_text
+from simpel_cli.report import figure, write_report
+from simpel_cli.rl.exchange import Exchange
+from simpel_cli.rl.online import Online
+from simpel_cli.rl.plant import Plant, Simulated, Stepped, write_ride
+from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
+from simpel_cli.run import Manifest, Settings, configure, make_directory, read_manifest, refuse_occupied, stream
+from simulators.model import Model
+
+WORLDS = "sim, mujoco, gymnasium:ID and folder:DIR"
+MEASURED = (
+    "noise_std",
+    "stack_actions",
+    "max_gap",
+    "derived",
+)  # keys of the data YAML that hold for a plant's episodes
+
+
+class Loop(NamedTuple):
+    """What stays the same from episode to episode."""
+
+    config: dict[str, Any]
+    directory: Path
+    settings: Settings
+    asked: Assignment
+    online: Online
+    plant: Plant
+    terminal: Terminal
+
+
+def rl_online(job: Job) -> None:
+    """Run in a new directory."""
+    directory = make_directory(job.directory)
+    refuse_occupied(directory)
+    config = resolved(job)
+    write_text(directory / "config.yaml", dump(config))
+    with Manifest(directory, "rl-online", settings_of(config)) as manifest:
+        _run(config, directory, manifest)
+
+
+def resume(directory: Path) -> None:
+    """Go on with an interrupted run: every step that is complete is kept, and the result is the same."""
+    record = read_manifest(directory)
+    if record["command"] != "rl-online":
+        raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-online.")
+    config = load(directory / "config.yaml")
+    if record.get("status") == "done":
+        Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
+        return
+    with Manifest(directory, "rl-online", settings_of(config)) as manifest:
+        _run(config, directory, manifest)
+
+
+def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
+    settings = settings_of(config)
+    if settings.seeds > 1:
+        raise ConfigError(
+            f"run.seeds: got {settings.seeds}; the episodes of one policy follow each other, so rl-online takes one. Run it "
+            "once per run.seed."
+        )
+    manifest.facts["device"] = str(configure(settings))
+    make_directory(directory / "episodes")
+    asked = assignment(config, settings)
+    online = build(config.get("online") or {}, "online", default=Online)
+    terminal = Terminal(settings.quiet, directory / "run.log")
+    plant = _plant(str(config.get("world")), config, settings, asked, online, terminal)
+    loop = Loop(config, directory, settings, asked, online, plant, terminal)
+    terminal.line(f"simpel rl-online · {settings.name} · seed {settings.seed}", style="bold")
+    terminal.line(
+        f"{online.episodes} episodes of {asked.task.horizon} steps in {config['world']}"
+        + (f" ({asked.truth_name})" if config["world"] == "sim" else ""),
+        "task",
+    )
+    for number in range(online.episodes):
+        _episode(loop, number)
+    write_metrics(directory / "metrics.parquet", _rows(loop), _constants(loop))
+    _publish(loop)
+
+
+def _plant(
+    world: str, config: dict[str, Any], settings: Settings, asked: Assignment, online: Online, terminal: Terminal
+) -> Plant:
+    """Return what `world` names.
+
+    Raises:
+        ConfigError: no such world, or what it needs is missing.
+    """
+    kind, _, rest = world.partition(":")
+    encoding, horizon, key = asked.encoding, asked.task.horizon, stream(settings.seed, "plant")
+    if kind == "sim" and not rest:
+        if asked.truth is None:
+            raise ConfigError(
+                "world: sim needs a true simulator, e.g. sim@truth=parking_car; for a rig use world=folder:DIR."
+            )
+        actor = asked.policy.bind(asked.truth, horizon, len(encoding.inputs)).actor
+        return Simulated(asked.truth, encoding, asked.goal, actor.act, horizon, key)
+    if kind == "mujoco" and not rest:
+        if not config.get("mujoco"):
+            raise ConfigError("world: mujoco needs a MuJoCo world, e.g. +sim@mujoco=rc_car_world.")
+        source = source_of({"sim": config["mujoco"]}, settings)
+        if isinstance(source, Model):
+            raise ConfigError(
+                f"mujoco: {source.name} is a simulator with equations; use it as sim@truth with world=sim."
+            )
+        noise = np.array([asked.task.noise_std.get(q.name, 0.0) for q in encoding.states])
+        return Stepped(WorldRig(source, encoding, asked.goal, noise, key), encoding, asked.goal, horizon)
+    if kind == "gymnasium" and rest:
+        return Stepped(GymnasiumRig(rest, encoding, settings.seed), encoding, asked.goal, horizon)
+    if kind == "folder" and rest:
+        folder = Path(rest).expanduser().absolute()
+        return Exchange(folder, encoding, asked.goal, horizon, online.wait, lambda text: terminal.line(text, "rig"))
+    hint = did_you_mean(kind, ["sim", "mujoco", "gymnasium", "folder"])
+    raise ConfigError(f"world: got {world!r}; allowed are {WORLDS}.{hint}")
+
+
+def _file(loop: Loop, number: int) -> Path:
+    return loop.directory / "episodes" / f"{number:03d}.parquet"
+
+
+def _folder(loop: Loop, number: int) -> Path:
+    return loop.directory / "rounds" / f"{number:03d}"
+
+
+def _episode(loop: Loop, number: int) -> None:
+    """Learn from the episodes before, act, and keep what came of it. What is complete is not done again."""
+    path, folder = _file(loop, number), _folder(loop, number)
+    if (folder / "round.json").exists():
+        return
+    make_directory(folder)
+    began = time.perf_counter()
+    model = learned(_fit_config(loop, number), folder / "posterior", loop.directory)
+    fitted = time.perf_counter()
+    flown = _trained(loop, number, model, folder)
+    trained = time.perf_counter()
+    if not path.exists():
+        ride = loop.plant.ride(number, folder / "policy")
+        write_ride(path, ride, loop.asked.encoding, model.study.system.source.dt)
+    facts = {
+        "return_in_model": float(flown.model_returns[0]),
+        "nll_before": _surprise(loop, number, model),
+        "broken_in_model": _broken(folder),
+        "fit_seconds": round(fitted - began, 3),
+        "policy_seconds": round(trained - fitted, 3),
+        "episode_seconds": round(time.perf_counter() - trained, 3),
+    }
+    write_text(folder / "round.json", json.dumps(facts, indent=1))
+    found = _facts(loop, number)
+    broken = (
+        f"   {100 * found['broken_in_model']:.0f} % of the roll-outs in the model diverged"
+        if found["broken_in_model"]
+        else ""
+    )
+    loop.terminal.line(
+        f"return {found['return']:.4g} (in the model {found['return_in_model']:.4g})"
+        + (f"   {'succeeded' if found['success'] else 'not yet'}" if loop.asked.task.success else "")
+        + f"   NLL before it was learned {found['nll_before']:.3g}   "
+        f"fit {facts['fit_seconds']:.0f} s, policy {facts['policy_seconds']:.0f} s{broken}",
+        f"episode {number}",
+    )
+
+
+def _fit_config(loop: Loop, number: int) -> dict[str, Any]:
+    """Return the fit to all episodes so far; to none, the posterior is the prior."""
+    config = {key: value for key, value in loop.config.items() if key not in OWN}
+    own = {key: value for key, value in config["data"].items() if key in MEASURED}
+    paths = [str(_file(loop, i)) for i in range(number)]
+    config["data"] = own | {"path": paths, "time": "t", "split": {"test_fraction": 0}}
+    config["run"] = config["run"] | {"quiet": True, "figures": False}
+    return config
+
+
+def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
+    """Train the policy of an episode."""
+    before = _folder(loop, number - 1) if loop.online.warm_start and number else None
+    done = folder / "checkpoint" / "state.safetensors"
+    constants = model.study.constants | {
+        "run": f"{loop.directory.name}/{number:03d}", "command": "rl-online",
+        "n_train": len(model.fitted.training[0][0]),
+    }  # fmt: skip
+    at = int(load_checkpoint(folder / "checkpoint")[1]["world_steps"]) if done.exists() else None
+    with MetricStream(folder, constants, resume_at=at) as metrics:
+        flown = train(model, loop.asked, loop.terminal, metrics, folder, label=f"policy {number}", before=before)
+        metrics.close()
+    saved_policies(folder, model, loop.asked, flown)
+    return flown
+
+
+def _surprise(loop: Loop, number: int, model: Learned) -> float:
+    """Return the negative log-likelihood per transition of an episode under the model that had not seen it yet."""
+    study = model.study
+    config = _fit_config(loop, number)["data"] | {"path": str(_file(loop, number))}
+    try:
+        recording = read(build(config, "data", default=Measurements), study.system.source, loop.directory, 0)
+        x, y = ev.test_arrays(transitions(recording.train, study.system.encoding.stack), study.system.encoding)
+    except DataError:  # too short an episode to tell
+        return float("nan")
+    posterior = posteriors(study, model.fitted, model.state)[0]
+    return float(np.mean(ev.one_step(posterior, x, y).nll[:, -1]))
+
+
+def _broken(folder: Path) -> float:
+    values = [r for r in read_metrics(folder / "metrics.parquet") if r["metric"] == "broken_in_model"]
+    return float(values[-1]["value"]) if values else 0.0
+
+
+def _facts(loop: Loop, number: int) -> dict[str, float]:
+    """Return what is known of an episode, from the files."""
+    table = columns_of(_file(loop, number))
+    good, settled = table["good"][:-1], loop.asked.task.settled
+    ended = bool(len(good) >= loop.asked.task.horizon and good[-settled:].all())
+    facts: dict[str, float] = json.loads((_folder(loop, number) / "round.json").read_text())
+    return facts | {"return": float(table["reward"].sum()), "steps": float(len(good)), "success": float(ended)}
+
+
+def _rows(loop: Loop) -> list[dict[str, Any]]:
+    """Metric rows, one per episode and quantity; step: the episode."""
+    rows = []
+    for number in range(loop.online.episodes):
+        for name, value in _facts(loop, number).items():
+            unit = "s" if name.endswith("seconds") else "nat" if name.startswith("nll") else "1"
+            base = {"seed": loop.settings.seed, "step": number, "split": "test", "output": ""}
+            rows.append(base | {"metric": name, "unit": unit, "value": float(value)})
+    return rows
+
+
+def _constants(loop: Loop) -> dict[str, Any]:
+    choices = loop.config["choices"]
+    return {
+        "experiment": loop.settings.name, "method": choices.get("method", ""), "sim": choices.get("sim", ""),
+        "data": loop.config["world"], "run": loop.directory.name, "command": "rl-online", "n_train": None,
+    }  # fmt: skip
+
+
+def _publish(loop: Loop) -> None:
+    """Draw the figures, write the report, and say what to type next."""
+    directory, last = loop.directory, loop.online.episodes - 1
+    head = (
+        "episode",
+        "return",
+        "in the model",
+        "succeeded",
+        "steps",
+        "NLL before it was learned",
+        "fit, s",
+        "policy, s",
+    )
+    rows = []
+    for number in range(loop.online.episodes):
+        f = _facts(loop, number)
+        rows.append((
+            str(number), f"{f['return']:.4g}", f"{f['return_in_model']:.4g}",
+            ("yes" if f["success"] else "no") if loop.asked.task.success else "-", f"{f['steps']:.0f}",
+            f"{f['nll_before']:.3g}", f"{f['fit_seconds']:.0f}", f"{f['policy_seconds']:.0f}",
+        ))  # fmt: skip
+    images = draw_online(directory) if loop.settings.figures else []
+    commands = [
+        f"python {_folder(loop, last) / 'policy' / 'run_policy.py'} < states.jsonl          # no JAX needed",
+        f"simpel evaluate {_folder(loop, last) / 'posterior'} data=NAME          # the last model, on measurements of yours",
+    ]
+    report = write_report(
+        directory / "report.html",
+        title=f"simpel rl-online · {loop.settings.name} · {loop.config['choices'].get('method', '')}",
+        lead=f"{loop.online.episodes} episodes of {loop.asked.task.horizon} steps in {loop.config['world']}; no data before "
+        "the first, whose policy was learned in the prior.",
+        sections=[{"title": "Episodes", "head": head, "rows": rows}, *(figure(path) for path in images)],
+        commands=commands,
+        config=dump(loop.config),
+    )
+    loop.terminal.line(str(report), "report")
+    for label, line in zip(["next", ""], commands, strict=True):
+        loop.terminal.line(f"{'' if label else ' ' * 10}{line}", label)

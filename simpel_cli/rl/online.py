@@ -1,0 +1,25 @@
+"""The `online:` group: how episodes in the plant follow each other."""
+
+from dataclasses import dataclass
+
+from simpel_cli.errors import ConfigError, check_at_least_one
+
+
+@dataclass(frozen=True)
+class Online:
+    """Learning from episodes of the policy's own.
+
+    Args:
+        episodes: in the plant.
+        warm_start: a policy is trained from where the one of the episode before ended; else from nothing.
+        wait: s, for an episode of a rig behind a folder.
+    """
+
+    episodes: int = 10
+    warm_start: bool = False
+    wait: float = 3600.0
+
+    def __post_init__(self) -> None:
+        check_at_least_one("online", self, ("episodes",))
+        if not self.wait > 0:
+            raise ConfigError(f"online.wait: got {self.wait}; it must be positive (s).")

@@ -1,0 +1,171 @@
+"""A plant: the system itself, which a policy drives for one episode at a time."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from simpel_cli.encoding import Encoding
+from simpel_cli.errors import DataError
+from simpel_cli.records import write_table
+from simpel_cli.rl.files import load_policy
+from simpel_cli.rl.policy import Policy
+from simpel_cli.rl.rollout import Episodes, episodes
+from simpel_cli.rl.runner import PolicyRunner
+from simpel_cli.rl.task import Goal
+from simpel_cli.rl.world import World
+
+LEAST_ROWS = 2  # of an episode: one transition
+
+
+class Ride(NamedTuple):
+    """One episode as it was measured, physical units.
+
+    Args:
+        states: (R, ds), the first before any command.
+        commands: (R - 1, du).
+        reward: (R - 1,), of the step that a command led to.
+        good: (R - 1,), whether the state was then where it should be.
+    """
+
+    states: np.ndarray
+    commands: np.ndarray
+    reward: np.ndarray
+    good: np.ndarray
+
+
+class Plant(Protocol):
+    """Whatever a policy drives."""
+
+    def ride(self, number: int, policy: Path) -> Ride:
+        """Drive one episode.
+
+        Args:
+            number: of the episode, from 0.
+            policy: folder with the policy and its contract.
+
+        Raises:
+            DataError: no episode came of it.
+        """
+        ...
+
+
+class Rig(Protocol):
+    """A plant that is stepped, physical units."""
+
+    def reset(self, number: int) -> np.ndarray:
+        """Begin an episode; return the measured states (ds,)."""
+        ...
+
+    def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Apply a command (du,) for one transition; return the measured states, the true ones or the same, and the end."""
+        ...
+
+
+def earned(goal: Goal, after: np.ndarray, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return reward, success and end of the steps of one episode.
+
+    Args:
+        goal: of the task.
+        after: states after every step, (T, ds).
+        commands: of every step, (T, du).
+    """
+    before = np.concatenate([np.array([goal.rest]), commands[:-1]])
+    judged = goal.judge(jnp.asarray(after), jnp.asarray(commands), jnp.asarray(before))
+    return np.asarray(judged.reward), np.asarray(judged.good), np.asarray(judged.over)
+
+
+class Simulated:
+    """A simulator with equations as the plant.
+
+    Args:
+        world: of it.
+        encoding: of its states.
+        goal: of the task.
+        act: (policy, observations) -> actions.
+        horizon: steps of an episode.
+        key: of the initial states and of the sensors' noise.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        encoding: Encoding,
+        goal: Goal,
+        act: Callable[[Policy, Float[Array, "B do"]], Float[Array, "B du"]],
+        horizon: int,
+        key: PRNGKeyArray,
+    ) -> None:
+        self.encoding, self.goal, self.key = encoding, goal, key
+
+        def one(policy: Policy, key: PRNGKeyArray) -> Episodes:
+            # a step more than counts: its observation is that of the last state
+            return episodes(world, lambda seen: act(policy, seen), key, 1, horizon + 1)
+
+        self._run = jax.jit(one)
+
+    def ride(self, number: int, policy: Path) -> Ride:
+        """Drive one episode; see `Plant`."""
+        found = self._run(load_policy(policy)[0], jax.random.fold_in(self.key, number))
+        found = jax.tree.map(lambda a: np.asarray(a)[:, 0] if a.ndim > 1 else np.asarray(a), found)
+        steps = max(min(int(found.lived.sum()), len(found.lived) - 1), 1)
+        states = np.asarray(self.encoding.decode(jnp.asarray(found.seen[:, : self.encoding.dim_state])))
+        commands = np.asarray(self.goal.command(jnp.asarray(found.action)))
+        return Ride(states[: steps + 1], commands[:steps], found.reward[:steps], found.good[:steps])
+
+
+class Stepped:
+    """A rig that is stepped, driven by the runner that needs numpy only.
+
+    Args:
+        rig: what is stepped.
+        encoding: names of states.
+        goal: of the task.
+        horizon: steps of an episode.
+    """
+
+    def __init__(self, rig: Rig, encoding: Encoding, goal: Goal, horizon: int) -> None:
+        self.rig, self.encoding, self.goal, self.horizon = rig, encoding, goal, horizon
+
+    def ride(self, number: int, policy: Path) -> Ride:
+        """Drive one episode; see `Plant`. It ends where a state is not finite."""
+        runner, names = PolicyRunner(policy), [q.name for q in self.encoding.states]
+        measured, true, commands = [np.asarray(self.rig.reset(number), float)], [], []
+        for _ in range(self.horizon):
+            if not np.isfinite(measured[-1]).all():
+                break
+            given = runner.command(dict(zip(names, measured[-1].tolist(), strict=True)))
+            command = np.array([given[q.name] for q in self.encoding.inputs])
+            seen, state, ended = self.rig.step(command)
+            if not (np.isfinite(seen).all() and np.isfinite(state).all()):
+                break
+            commands.append(command)
+            measured.append(np.asarray(seen, float))
+            true.append(np.asarray(state, float))
+            if ended or earned(self.goal, np.array(true[-1:]), np.array(commands[-1:]))[2][0]:
+                break
+        if not commands:
+            raise DataError(f"episode {number}: no step was possible; a state was not finite at once: {measured[0]}.")
+        reward, good, _ = earned(self.goal, np.array(true), np.array(commands))
+        return Ride(np.array(measured), np.array(commands), reward, good)
+
+
+def write_ride(path: Path, ride: Ride, encoding: Encoding, dt: float) -> None:
+    """Write an episode as measurements; of the last row, whose command nobody saw, the command is repeated.
+
+    Args:
+        path: of the Parquet file.
+        ride: the episode.
+        encoding: names and units.
+        dt: s, between rows.
+    """
+    held = np.concatenate([ride.commands, ride.commands[-1:]])
+    columns: dict[str, Any] = {"t": np.arange(len(ride.states)) * dt}
+    columns |= {q.name: ride.states[:, i].astype(float) for i, q in enumerate(encoding.states)}
+    columns |= {q.name: held[:, i].astype(float) for i, q in enumerate(encoding.inputs)}
+    columns |= {"reward": np.append(ride.reward, 0.0).astype(float), "good": np.append(ride.good, ride.good[-1])}
+    write_table(path, columns, {"t": "s"} | {q.name: q.unit for q in (*encoding.states, *encoding.inputs)})
