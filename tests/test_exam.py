@@ -428,6 +428,7 @@ def test_of_the_columns_of_an_effect_those_that_fit_best_are_kept(key: str, at: 
     assert len({(c.effect, c.acts_on) for c in kept}) == len(kept) - 1
 
 
+@pytest.mark.slow  # tests/test_discover.py finds one from end to end
 def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(CACHE))
     folder, file = places(tmp_path, 0)

@@ -151,7 +151,8 @@ def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
     np.testing.assert_allclose(gain, left.gains[0], atol=0.5)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_process_noise_is_no_function_of_two(tmp_path: Path, seed: int) -> None:
     search, _, first, left = looked(lane(lambda s: 0.0, 0.3, seed), tmp_path)
     assert first == left

@@ -188,6 +188,7 @@ def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly(weight: f
         np.testing.assert_allclose(found[:, :, i], np.linalg.solve(curvature, velocity[:, :, i].T).T, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_newtons_direction_reaches_in_few_steps_the_posterior_of_a_line_that_is_nearly_right() -> None:
     y = 1.3 * X - 0.4 + 0.05 * np.sin(3 * X) + NOISE * RANDOM.normal(size=X.shape)
     prior, kappa = prior_of(gap=True), 0.05
@@ -428,7 +429,8 @@ EVERY = {
 }  # fmt: skip
 
 
-ALIKE = ("map", "repulsive")  # the class of fsvgd, with another velocity
+# the class of fsvgd, with another velocity; a state of the same arrays, or none that grows
+ALIKE = ("map", "repulsive", "svgd", "sysid", "gp")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in EVERY])

@@ -82,7 +82,7 @@ def test_experiment_runs_on_its_recording(
 
 
 @pytest.mark.parametrize(
-    "experiment", ["racecar", *(pytest.param(e, marks=pytest.mark.slow) for e in ("greenhouse", "sergio"))]
+    "experiment", [pytest.param(e, marks=pytest.mark.slow) for e in ("racecar", "greenhouse", "sergio")]
 )
 def test_experiment_runs_on_data_that_come_along(experiment: str, tmp_path: Path) -> None:
     small = [w for w in TINY if not w.startswith("method.steps")]
