@@ -1,10 +1,10 @@
 """What a person sees in the terminal: labelled lines, one progress bar, plain tables. Quiet when asked."""
 
-import logging
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +36,15 @@ class Terminal:
         # a wide console when the output is a file or a pipe: lines are for grep, not for wrapping
         wide = sys.stdout is None or not sys.stdout.isatty()  # None: closed before the start (`simpel fit >&-`)
         self.console = _Screen(quiet=quiet, highlight=False, width=240 if wide else None)
-        self._log = logging.Logger("simpel", logging.INFO)  # its own: a verb may run another one, with a log of its own
-        handler = logging.FileHandler(log) if log is not None else logging.NullHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-        self._log.addHandler(handler)
+        self.log = log
 
     def line(self, text: str = "", label: str = "", style: str = "") -> None:
         """Print a line, with a label in its own column."""
         shown = f"{label:<10}{text}" if label else text
         self.console.print(shown, style=style, markup=False, soft_wrap=True)
-        if shown:
-            self._log.info(shown)
+        if shown and self.log is not None:
+            with self.log.open("a") as file:
+                file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shown}\n")
 
     @contextmanager
     def progress(self, label: str, total: int, start: int) -> Iterator[Any]:

@@ -1,7 +1,7 @@
 """Inputs as they arrive: through a play, delayed and lagged, as means over the integrator's substeps.
 
-A held input is a staircase; its integral U(t) is piecewise linear, so the mean over a substep that lies d in the past,
-(U(t + h - d) - U(t - d))/h, is continuous in d, below one sample too.
+A held input is a staircase; the mean over a substep that lies d in the past is a sum over samples, each weighted with the
+share of the substep that it fills: continuous in d, below one sample too.
 """
 
 import jax
@@ -27,25 +27,24 @@ def arriving(
         lag: time constant of a first-order lag behind the delay, s, per input; 0 = none.
         dt: distance of the rows, s.
         substeps: per row.
-        lead: rows of the past.
+        lead: rows of the past; no delay is longer.
         half_play: half width of a play in front of the delay, in units of u, per input (see `play`); None: of no input.
     """
     if half_play is not None:
         u = play(u, half_play)
-    rows = u.shape[0]
-    h = dt / substeps
-    integral = jnp.concatenate([jnp.zeros((1, u.shape[1]), u.dtype), jnp.cumsum(u, axis=0)]) * dt
-    edges = jnp.arange(rows * substeps + 1, dtype=u.dtype) * h
+    rows, h = u.shape[0], dt / substeps
     order = jnp.arange(1, rows * substeps + 1, dtype=u.dtype)
+    # the row of every weight, behind the end of every substep; whole numbers and fractions, no floor: two compiled loops may
+    # round a quotient to two sides of a row, and read one sample with the weight of another
+    back = jnp.arange(lead, -1, -1, dtype=u.dtype)[None] + (jnp.arange(substeps + 1, dtype=u.dtype) / substeps)[:, None]
+    held = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])  # before the record the first input was held
+    near = held[jnp.arange(rows)[:, None] + jnp.arange(lead + 1)[None]]
 
-    def one(total: Array, first: Array, d: Array, tau: Array) -> Array:
-        at = edges - d[None]
-        position = jnp.clip(at / dt, 0.0, float(rows))
-        # at a row itself the segment before it: the slope in d is then that of a delay that begins to grow
-        low = jnp.clip(jnp.ceil(position).astype(jnp.int32) - 1, 0, rows - 1)
-        value = total[low] + (position - low.astype(u.dtype)) * (total[low + 1] - total[low])
-        value = value + jnp.minimum(at, 0.0) * first[None]  # before the record the first input was held
-        mean = jnp.diff(value) / h
+    def one(near: Array, d: Array, tau: Array) -> Array:
+        passed = back - d / dt
+        weight = jnp.diff(_ramp(passed), axis=0) * substeps
+        weight = weight.at[:, 0].add(1 - jnp.sum(weight, axis=1))  # later than all that is known: the oldest
+        mean = jnp.dot(near, weight.T, precision=jax.lax.Precision.HIGHEST).reshape(-1)
         # exact answer of the lag to a staircase; its mean over a substep
         ratio = h / (tau + 1e-15 * h)
         keep = jnp.exp(-ratio)
@@ -58,8 +57,13 @@ def arriving(
         before = jnp.concatenate([mean[:1], ends[:-1]])
         return mean + (before - mean) * ((1 - keep) / ratio)[None]
 
-    every = jax.vmap(one, in_axes=(1, 0, 0, 0), out_axes=1)(integral, u[0], delay, lag)
+    every = jax.vmap(one, in_axes=(2, 0, 0), out_axes=1)(near, delay, lag)
     return every.reshape(rows, substeps, -1)[lead:]
+
+
+def _ramp(passed: Array) -> Array:
+    """Return how much of a sample has passed, from 0 to 1; at both ends the slope is that of a delay that begins to grow."""
+    return jnp.where(passed <= 0, 0.0, jnp.where(passed > 1, 1.0, passed))
 
 
 def play(u: Float[Array, "R nu"], half: Float[Array, " nu"]) -> Float[Array, "R nu"]:

@@ -104,3 +104,16 @@ def test_the_slope_in_a_play_is_that_of_a_growing_one(half: float) -> None:
     slope = (total(jnp.asarray(half + 1e-6)) - total(jnp.asarray(half))) / 1e-6
     assert abs(slope) > 1
     np.testing.assert_allclose(jax.grad(total)(jnp.asarray(half)), slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 3])
+def test_a_delay_of_whole_rows_is_that_however_it_is_compiled(rows: int) -> None:
+    """In single precision a quotient of times falls to either side of a whole number."""
+    dt, inputs = 1 / 30, jax.random.uniform(jax.random.key(0), (64, 4, 2), jnp.float32, -1, 1)
+    late = jnp.full(2, rows * 0.1 / 3, jnp.float32)
+
+    def arrived(u: jax.Array, delay: jax.Array) -> jax.Array:
+        return arriving(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0]
+
+    found = jax.jit(jax.vmap(arrived, in_axes=(0, None)))(inputs, late)
+    np.testing.assert_allclose(found, np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=5e-6)
