@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ class Ride(NamedTuple):
     good: np.ndarray
 
 
+@runtime_checkable
 class Plant(Protocol):
     """Whatever a policy drives."""
 
@@ -54,6 +55,7 @@ class Plant(Protocol):
         ...
 
 
+@runtime_checkable
 class Rig(Protocol):
     """A plant that is stepped, physical units."""
 

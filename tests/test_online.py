@@ -1,0 +1,307 @@
+"""Plants, the exchange with a rig, and learning from episodes of the policy's own, from end to end."""
+
+import json
+import shutil
+import sys
+import threading
+import time
+import types
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from command_line import ROOT, simpel
+
+from simpel_cli.data import Measurements, read
+from simpel_cli.encoding import Encoding
+from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.nets import MLP
+from simpel_cli.nodes import build
+from simpel_cli.records import read_metrics, write_table
+from simpel_cli.rl.exchange import Exchange
+from simpel_cli.rl.files import contract, save_policy
+from simpel_cli.rl.plant import Simulated, Stepped, write_ride
+from simpel_cli.rl.policy import Actor, Policy
+from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
+from simpel_cli.rl.runner import PolicyRunner
+from simpel_cli.rl.task import Task
+from simpel_cli.rl.world import true_world
+from simpel_cli.transition import encoding_of, transition
+
+HORIZON = 12
+FLOAT32 = jnp.dtype("float32")
+
+
+def of_conf(group: str, name: str) -> Any:
+    return yaml.safe_load((ROOT / "conf" / group / f"{name}.yaml").read_text())
+
+
+def policy_in(folder: Path, encoding: Encoding, task: Task, memory: int) -> Actor:
+    """Save a policy of random weights."""
+    goal, dim_u = task.bind(encoding), len(encoding.inputs)
+    actor = Actor(MLP((8,), negative_slope=0.0), dim_u)
+    size = encoding.dim_state + memory * dim_u
+    policy = Policy(actor.init(jax.random.key(0), size, FLOAT32), jnp.zeros(size), jnp.full(size, 0.3))
+    save_policy(folder, policy, contract(encoding, goal, memory, 0.05))
+    return actor
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[Any, Encoding, Task]:
+    model = build(of_conf("sim", "pendulum_high_fidelity"), "sim").model()
+    return model, encoding_of(model), build(of_conf("reward", "swing_up"), "reward")
+
+
+def test_a_simulated_episode_is_what_its_rows_say(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    """Without sensor noise every row follows from the one before, and the reward from both."""
+    model, encoding, task = swing
+    goal = task.bind(encoding)
+    actor = policy_in(tmp_path, encoding, task, 0)
+    phi = jnp.asarray([q.middle for q in model.params], jnp.float32)
+    step = transition(model, encoding).step
+    world = true_world(encoding, goal, step, phi, jnp.zeros(2, jnp.float32))
+    plant = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3))
+    ride = plant.ride(0, tmp_path)
+    assert ride.states.shape == (HORIZON + 1, 2)
+    assert ride.commands.shape == (HORIZON, 1)
+    x = jnp.concatenate([encoding.encode(jnp.asarray(ride.states[:-1])), jnp.asarray(ride.commands)], axis=1)
+    after = encoding.advance(x[:, : encoding.dim_state], jax.vmap(step, in_axes=(0, None))(x, phi).astype(x.dtype))
+    np.testing.assert_allclose(encoding.decode(after), ride.states[1:], atol=2e-5)
+    judged = goal.judge(jnp.asarray(ride.states[1:]), jnp.asarray(ride.commands), jnp.asarray(ride.commands))
+    np.testing.assert_allclose(judged.reward, ride.reward, atol=2e-5)
+    other = plant.ride(1, tmp_path)
+    assert not np.allclose(other.states, ride.states)
+    np.testing.assert_array_equal(plant.ride(0, tmp_path).states, ride.states)
+
+
+def test_an_episode_is_read_as_it_was_written(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    model, encoding, task = swing
+    goal = task.bind(encoding)
+    actor = policy_in(tmp_path, encoding, task, 0)
+    phi = jnp.asarray([q.middle for q in model.params], jnp.float32)
+    noise = jnp.full(2, 0.05, jnp.float32)
+    world = true_world(encoding, goal, transition(model, encoding).step, phi, noise)
+    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).ride(0, tmp_path)
+    write_ride(tmp_path / "000.parquet", ride, encoding, model.dt)
+    asked = Measurements(path=(str(tmp_path / "000.parquet"),), time="t", split={"test_fraction": 0})
+    recording = read(asked, model, tmp_path, 0)
+    assert recording.test == ()
+    (episode,) = recording.train
+    np.testing.assert_allclose(episode.states, np.unwrap(ride.states, axis=0), atol=1e-6)
+    np.testing.assert_allclose(episode.inputs[:-1], ride.commands, atol=1e-6)
+
+
+def test_the_mujoco_car_is_driven(tmp_path: Path) -> None:
+    """Its hidden states begin at rest, its commands act late, its noise is the sensors'."""
+    model = build(of_conf("sim", "parking_bicycle"), "sim").model()
+    encoding, task = encoding_of(model, stack=3), build(of_conf("reward", "parking"), "reward")
+    goal = task.bind(encoding)
+    policy_in(tmp_path, encoding, task, 3)
+    world = build(of_conf("sim", "rc_car_world"), "sim").model()
+    rig = WorldRig(world, encoding, goal, np.zeros(6), jax.random.key(0))
+    ride = Stepped(rig, encoding, goal, HORIZON).ride(0, tmp_path)
+    assert ride.states.shape == (HORIZON + 1, 6)
+    low, high = np.array(goal.low), np.array(goal.high)
+    assert ((ride.commands >= low) & (ride.commands <= high)).all()
+    moved = np.hypot(*(ride.states - ride.states[0])[:, :2].T)
+    assert moved[2] < 0.01 < moved[-1]  # nothing arrives within the first three steps
+    noisy = WorldRig(world, encoding, goal, np.full(6, 0.1), jax.random.key(0))
+    assert 0.01 < np.abs(noisy.reset(0) - rig.reset(0)).max() < 0.5
+    np.testing.assert_array_equal(noisy.reset(1), noisy.reset(1))
+    bare = encoding_of(build(of_conf("sim", "pendulum"), "sim").model())
+    with pytest.raises(ConfigError, match=r"states of rc_car_world are x, y, .*; those of sim are phi, omega"):
+        WorldRig(world, bare, goal, np.zeros(2), jax.random.key(0))
+
+
+class Cart:
+    """An environment of gymnasium's protocol: a mass without friction."""
+
+    def __init__(self, named: bool = True, broken_at: int | None = None) -> None:
+        self.named, self.broken_at, self.state, self.steps = named, broken_at, np.zeros(2), 0
+
+    def reset(self, seed: int) -> tuple[Any, dict[str, Any]]:
+        self.state, self.steps = np.random.default_rng(seed).normal(size=2), 0
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        self.state = self.state + 0.05 * np.array([self.state[1], float(action[0])])
+        if self.steps == self.broken_at:
+            self.state = self.state * np.nan
+        return self._seen(), -1.0, False, self.steps == 8, {}
+
+    def _seen(self) -> Any:
+        return {"phi": self.state[0], "omega": self.state[1]} if self.named else self.state
+
+
+@pytest.fixture
+def gymnasium(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(name: str) -> Cart:
+        made = {"named": Cart(), "plain": Cart(False), "breaks": Cart(broken_at=4), "breaks_at_once": Cart(broken_at=1)}
+        if name not in made:
+            raise ValueError("no such environment")
+        return made[name]
+
+    monkeypatch.setitem(sys.modules, "gymnasium", types.SimpleNamespace(make=make))
+
+
+@pytest.mark.parametrize(("name", "steps"), [("named", 8), ("plain", 8), ("breaks", 3)])
+@pytest.mark.usefixtures("gymnasium")
+def test_a_gymnasium_environment_is_driven(
+    name: str, steps: int, swing: tuple[Any, Encoding, Task], tmp_path: Path
+) -> None:
+    """It ends where it says so, and where a state is not finite: that row is no measurement."""
+    _, encoding, task = swing
+    policy_in(tmp_path, encoding, task, 0)
+    ride = Stepped(GymnasiumRig(name, encoding, 0), encoding, task.bind(encoding), HORIZON).ride(0, tmp_path)
+    assert ride.states.shape == (steps + 1, 2)
+    assert np.isfinite(ride.states).all()
+    assert ride.reward.shape == ride.good.shape == (steps,)
+
+
+@pytest.mark.usefixtures("gymnasium")
+def test_an_environment_that_cannot_be_used(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    _, encoding, task = swing
+    with pytest.raises(ConfigError, match="gymnasium cannot make 'nothing': no such environment"):
+        GymnasiumRig("nothing", encoding, 0)
+    policy_in(tmp_path, encoding, task, 0)
+    rig = GymnasiumRig("breaks_at_once", encoding, 0)
+    with pytest.raises(DataError, match="no step was possible"):
+        Stepped(rig, encoding, task.bind(encoding), HORIZON).ride(0, tmp_path)
+
+
+def answer_of(folder: Path, rows: int) -> dict[str, Any]:
+    """What a rig measures, driven by the runner beside its policy."""
+    runner = PolicyRunner(folder)
+    state, columns = {"phi": 3.0, "omega": 0.0}, {"phi": [], "omega": [], "u": []}
+    for _ in range(rows):
+        command = runner.command(state)
+        for name, value in (state | command).items():
+            columns[name].append(value)
+        state = {"phi": state["phi"] + 0.05 * state["omega"], "omega": state["omega"] + 0.05 * command["u"]}
+    return {name: np.array(values) for name, values in columns.items()}
+
+
+def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    """Bad answers are kept, named and asked for again; the good one is used."""
+    _, encoding, task = swing
+    policy_in(tmp_path / "policy", encoding, task, 0)
+    said: list[str] = []
+    folder = tmp_path / "rig"
+    exchange = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, said.append)
+    target, own = folder / "episode_002.parquet", folder / "episode_002"
+
+    def rig() -> None:
+        while not (own / "request.json").exists():
+            time.sleep(0.02)
+        assert json.loads((own / "request.json").read_text())["answer"] == target.name
+        good = answer_of(own, HORIZON + 1)
+        wrong = {
+            "phi": good | {"phi": np.where(np.arange(HORIZON + 1) == 5, np.nan, good["phi"])},
+            "u is 1e+09": good | {"u": np.full(HORIZON + 1, 1e9)},
+            "the column omega is missing": {k: v for k, v in good.items() if k != "omega"},
+            "1 rows": {k: v[:1] for k, v in good.items()},
+        }
+        for i, columns in enumerate(wrong.values(), 1):
+            write_table(target, columns)
+            while not (folder / f"episode_002.refused-{i}.txt").exists():
+                time.sleep(0.02)
+        write_table(target, good)
+
+    thread = threading.Thread(target=rig, daemon=True)
+    thread.start()
+    ride = exchange.ride(2, tmp_path / "policy")
+    thread.join()
+    assert ride.states.shape == (HORIZON + 1, 2)
+    problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 5)]
+    for problem, expected in zip(
+        problems, ("row 5: phi is nan", "row 0: u is 1e+09", "the column omega is missing", "1 rows"), strict=True
+    ):
+        assert expected in problem
+    assert len(list(folder.glob("*.refused-*.parquet"))) == 4
+    assert "waiting for" in said[0]
+    np.testing.assert_allclose(exchange.ride(2, tmp_path / "policy").states, ride.states)  # still there: taken again
+
+
+def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    _, encoding, task = swing
+    policy_in(tmp_path / "policy", encoding, task, 0)
+    exchange = Exchange(tmp_path / "rig", encoding, task.bind(encoding), HORIZON, 0.1, lambda text: None)
+    with pytest.raises(DataError, match=r"did not come within 0.1 s .*--resume"):
+        exchange.ride(0, tmp_path / "policy")
+    assert (tmp_path / "rig" / "episode_000" / "run_policy.py").exists()
+
+
+SMALL = (
+    "rl-online", "experiment=pendulum_swing_up", "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]",
+    "method.pool=64", "prior.draws=64", "policy.steps=4000", "policy.environments=8", "policy.looks=3", "policy.hidden=[16]",
+    "control.episodes=4", "reward.horizon=12", "reward.settled=5", "online.episodes=3",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("online")
+    result = simpel(folder, *SMALL, "online.warm_start=true", "hydra.run.dir=run")
+    assert result.code == 0, result.err
+    assert "episode 2 return" in result.out
+    return folder / "run"
+
+
+def test_the_run_holds_what_is_promised(driven: Path) -> None:
+    assert json.loads((driven / "manifest.json").read_text())["status"] == "done"
+    for name in ("returns.png", "trajectories.png", "report.html", "rounds/002/policy/run_policy.py"):
+        assert (driven / name).exists(), name
+    rows = read_metrics(driven / "metrics.parquet")
+    assert {r["step"] for r in rows} == {0, 1, 2}
+    by = {(r["metric"], r["step"]): r["value"] for r in rows}
+    for number in range(3):
+        table = pq.read_table(driven / "episodes" / f"{number:03d}.parquet").to_pydict()
+        assert len(table["t"]) == 13
+        np.testing.assert_allclose(by["return", number], sum(table["reward"]), rtol=1e-6)
+    learned = [
+        r["n_train"] for i in range(3) for r in read_metrics(driven / "rounds" / f"{i:03d}" / "metrics.parquet")[:1]
+    ]
+    assert learned == [0, 12, 24]
+    assert by["nll_before", 2] < by["nll_before", 0]  # what was measured helps
+
+
+def test_a_run_that_was_killed_goes_on_to_the_same_end(driven: Path, tmp_path: Path) -> None:
+    """As a kill leaves it while the third policy is trained, and again before the second episode was kept."""
+    for last, gone in ((2, "policy"), (1, "round.json")):
+        run = tmp_path / str(last)
+        shutil.copytree(driven, run)
+        for number in range(last, 3):
+            (run / "episodes" / f"{number:03d}.parquet").unlink()
+            (run / "rounds" / f"{number:03d}" / "round.json").unlink()
+            if gone == "policy" or number > last:
+                shutil.rmtree(run / "rounds" / f"{number:03d}")
+        record = json.loads((run / "manifest.json").read_text()) | {"status": "running"}
+        (run / "manifest.json").write_text(json.dumps(record))
+        result = simpel(tmp_path, "rl-online", "--resume", str(last))
+        assert result.code == 0, result.err
+        for name in ("episodes/002.parquet", "rounds/002/policy/policy.safetensors"):
+            assert (run / name).read_bytes() == (driven / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("world=foldr:rig",), "world: got 'foldr:rig'; allowed are sim, mujoco, gymnasium:ID and folder:DIR"),
+        (("world=mujoco",), "world: mujoco needs a MuJoCo world"),
+        (("run.seeds=2",), "rl-online takes one"),
+        (("online.episodes=0",), "online.episodes: got 0; it must be at least 1"),
+        (("online.warmstart=true",), "online.warmstart: no such key"),
+        (("world=folder:rig", "online.wait=0.1"), "did not come within 0.1 s"),
+    ],
+)
+def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    result = simpel(tmp_path, *SMALL, *words, "run.quiet=true", "hydra.run.dir=run")
+    assert result.code in (2, 3)
+    assert message in result.err
+    assert "Traceback" not in result.err
