@@ -16,7 +16,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b bench-simulators differences
+.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -91,6 +91,12 @@ reproduce-bimodal: install ## Make the paper's figure of two modes: four score e
 
 reproduce-panel-a: install ## Make the paper's panel of four simulated systems (size=small or full; out=DIR to go on)
 	$(BIN)/python -m tests.reproduce.panel_a --size $(size) $(if $(out),--out $(out))
+
+reproduce-offline: install ## Make the paper's parking from recorded drives (size=small or full; out=DIR to go on)
+	$(BIN)/python -m tests.reproduce.control offline --size $(size) $(if $(out),--out $(out))
+
+reproduce-online: install ## Make the paper's parking from episodes of its own (size=small or full; out=DIR to go on)
+	$(BIN)/python -m tests.reproduce.control online --size $(size) $(if $(out),--out $(out))
 
 reproduce-panel-b: install ## Make the paper's panel of the recorded RC car (size=small or full; needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.reproduce.panel_b --size $(size) $(if $(out),--out $(out))

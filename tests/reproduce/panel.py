@@ -4,6 +4,7 @@ A fit is what `simpel fit` does with the words of the job; its directory keeps t
 """
 
 import argparse
+import importlib
 import itertools
 import multiprocessing
 import os
@@ -35,7 +36,8 @@ class Fit(NamedTuple):
         system, method: names of the panel.
         n_train: training transitions.
         data_seed: of measurements, or of what of them is trained on.
-        words: overrides of `simpel fit`.
+        words: overrides of the verb.
+        verb: of simpel.
     """
 
     system: str
@@ -43,6 +45,7 @@ class Fit(NamedTuple):
     n_train: int
     data_seed: int
     words: tuple[str, ...]
+    verb: str = "fit"
 
     @property
     def name(self) -> str:
@@ -166,8 +169,9 @@ def _fit_all(fits: Sequence[Fit], out: Path) -> list[tuple[str, str]]:
 
 
 def _fit(fit: Fit, directory: Path) -> str:
-    from simpel_cli.commands.fit import fit as task
-
+    task = getattr(
+        importlib.import_module(f"simpel_cli.commands.{fit.verb.replace('-', '_')}"), fit.verb.replace("-", "_")
+    )
     began = time.perf_counter()
     for number in itertools.count():  # what a kill left behind stays for whoever wants to look at it
         if not directory.exists():
@@ -176,12 +180,19 @@ def _fit(fit: Fit, directory: Path) -> str:
             directory.rename(old)
     words = [*fit.words, f"hydra.run.dir={directory}", "run.figures=false", "run.quiet=true"]
     try:
-        launch("fit", task, words, config_dir=CONF, flags=[])
+        launch(fit.verb, task, words, config_dir=CONF, flags=[])
     except Exception as error:  # whatever it is, it costs this fit and no other
         return f"failed: {error!r}"
     write_text(directory / WORDS, "\n".join(fit.words) + "\n")
-    nll = [r["value"] for r in tested(directory) if (r["metric"], r["output"]) == ("nll", "joint")]
-    return f"NLL {np.mean(nll):.3g}  {time.perf_counter() - began:.0f} s"
+    return f"{_came_to(tested(directory))}  {time.perf_counter() - began:.0f} s"
+
+
+def _came_to(rows: list[dict[str, Any]]) -> str:
+    for metric, name in (("nll", "NLL"), ("return_in_truth", "return"), ("return", "returns")):
+        values = [r["value"] for r in rows if r["metric"] == metric and r["output"] in ("", "joint")]
+        if values:
+            return f"{name} {np.mean(values):.3g}"
+    return "done"
 
 
 def tested(directory: Path) -> list[dict[str, Any]]:
