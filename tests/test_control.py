@@ -19,6 +19,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.rl.files import contract, load_policy, save_policy
+from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Transitions, batches, empty, put
 from simpel_cli.rl.rollout import episodes
@@ -448,3 +449,13 @@ def test_the_runner_needs_no_jax(flown: Path) -> None:
 def test_a_fit_takes_the_experiment_of_a_task(tmp_path: Path) -> None:
     result = simpel(tmp_path, "fit", *SMALL[1:7], "--cfg", "job")
     assert result.code == 0, result.err
+
+
+def test_fine_tuning_climbs_the_return() -> None:
+    """In a world without memory whose reward is highest where the action is half of what is seen."""
+    world = probe(lambda sign, a, over: -((a - 0.5 * sign) ** 2), signs=True)
+    actor = Actor(MLP((8,), negative_slope=0.0), 1)
+    begun = Policy(actor.init(jax.random.key(0), 1, jnp.dtype("float32")), *(jnp.full(1, v, jnp.float32) for v in (0, 1)))
+    better, returns = fine_tuned(world, actor, begun, jax.random.key(1), 1, 300, 0.02)
+    assert float(returns[0]) < -0.05
+    np.testing.assert_allclose(actor.act(better, jnp.array([[-1.0], [1.0]], jnp.float32))[:, 0], [-0.5, 0.5], atol=0.03)

@@ -21,6 +21,7 @@ from simpel_cli.inference import Problem
 from simpel_cli.nodes import build
 from simpel_cli.records import MetricStream
 from simpel_cli.rl.control import Control
+from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.rollout import Episodes, episodes
 from simpel_cli.rl.sac import SAC, Rule
@@ -188,6 +189,22 @@ def train(
     truth_judge = judge_of(asked, dim_u) if asked.truth is not None else None
     policies_of = jax.jit(jax.vmap(lambda arrays, state: bind(arrays).policy(state)))
 
+    def in_truth(policies: Policy) -> np.ndarray | None:
+        if truth_judge is None:
+            return None
+        return np.asarray(truth_judge(policies, stream(0, "truth")).reward.sum(axis=1).mean(axis=1))
+
+    def improved(arrays: tuple[Problem, Any], policy: Policy, key: PRNGKeyArray) -> Policy:
+        return fine_tuned(
+            world_at(arrays, 0.0),
+            bind(arrays).actor,
+            policy,
+            key,
+            task.horizon,
+            control.fine_tune,
+            control.fine_tune_rate,
+        )[0]
+
     program = loop.compiled(bind, problems, keys, stretch)
     shape = loop.state_shape(bind, problems, keys)
 
@@ -208,16 +225,19 @@ def train(
             now = policies_of(problems, one.state)
             earned, broken = model_judge(problems, now, stream(0, "judge"))
             best = Best(now, earned) if best is None else _better(best, Best(now, earned))
-            true = (
-                np.asarray(truth_judge(now, stream(0, "truth")).reward.sum(axis=1).mean(axis=1))
-                if truth_judge
-                else None
-            )
+            true = in_truth(now)
             metrics.add(_rows(seeds, sac.policies, one.step * per, np.asarray(earned), np.asarray(broken), true))
             keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
             note = f"return in the model {float(best.returns.max()):.4g}"
             update(one.step, note + (f", in the truth {true.max():.4g}" if true is not None else ""))
     assert best is not None
+    if control.fine_tune:
+        began_tuning = jnp.stack([jax.random.fold_in(key, sac.policies) for key in keys])
+        tuned = jax.jit(jax.vmap(improved))(problems, best.policy, began_tuning)
+        earned, broken = model_judge(problems, tuned, stream(0, "judge"))
+        at = iterations * per + control.fine_tune
+        metrics.add(_rows(seeds, sac.policies, at, np.asarray(earned), np.asarray(broken), in_truth(tuned)))
+        best = _better(best, Best(tuned, earned))
     return _of_seeds(best, len(seeds), sac.policies, time.perf_counter() - began, program.compile_seconds)
 
 

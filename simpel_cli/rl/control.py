@@ -16,12 +16,17 @@ class Control:
         aleatoric: whether roll-outs have the learned noise, too.
         data_share: share of the roll-outs that begin at a measured state; the others begin as the task does.
         episodes: that a policy is judged on, in the model and in the truth.
+        fine_tune: steps of gradient ascent on the return in the model, from the best look on; it climbs the model's errors,
+            too. What does not earn more in the model is not kept.
+        fine_tune_rate: of Adam at the start, along a cosine.
     """
 
     sampling: str = "ts1"
     aleatoric: bool = True
     data_share: float = 0.5
     episodes: int = 100
+    fine_tune: int = 0
+    fine_tune_rate: float = 1e-3
 
     def __post_init__(self) -> None:
         if self.sampling not in SAMPLING:
@@ -30,3 +35,7 @@ class Control:
         if not 0 <= self.data_share <= 1:
             raise ConfigError(f"control.data_share: got {self.data_share}; allowed is 0 to 1.")
         check_at_least_one("control", self, ("episodes",))
+        if self.fine_tune < 0:
+            raise ConfigError(f"control.fine_tune: got {self.fine_tune}; it must be 0 (off) or more.")
+        if not self.fine_tune_rate > 0:
+            raise ConfigError(f"control.fine_tune_rate: got {self.fine_tune_rate}; it must be positive.")
