@@ -24,6 +24,7 @@ ROLES = {
     "score": "gap_draws",
     "method": "bind",
     "policy": "bind",
+    "planner": "bind",
     "reward": "bind",
 }
 

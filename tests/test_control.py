@@ -20,9 +20,10 @@ from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.rl.files import contract, load_policy, save_policy
 from simpel_cli.rl.fine_tune import fine_tuned
+from simpel_cli.rl.planner import ICEM
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Transitions, batches, empty, put
-from simpel_cli.rl.rollout import episodes
+from simpel_cli.rl.rollout import episodes, reflex
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.sac import SAC, Scaler
 from simpel_cli.rl.task import Judged, Task
@@ -177,7 +178,7 @@ def test_what_is_not_finite_ends_an_episode_and_stays_out_of_the_state() -> None
     world = true_world(
         CART, goal, lambda x, phi: jnp.where(x[-1] > 0, jnp.nan, 0.1) * jnp.ones(3), jnp.zeros(0), jnp.zeros(2)
     )
-    found = episodes(world, lambda seen: jnp.array([[1.0], [-1.0]], seen.dtype), jax.random.key(0), 2, 10)
+    found = episodes(world, reflex(lambda seen: jnp.array([[1.0], [-1.0]], seen.dtype)), jax.random.key(0), 2, 10)
     assert np.isfinite(found.encoded).all()
     assert found.broken.tolist() == [True, False]
     assert found.lived.sum(axis=0).tolist() == [1, 10]
@@ -187,7 +188,7 @@ def test_what_is_not_finite_ends_an_episode_and_stays_out_of_the_state() -> None
 def test_stop_ends_an_episode_and_nothing_is_earned_after_it() -> None:
     goal = Task(reward="1", horizon=6, stop="s > 0.25", success="s > 0.25", settled=1).bind(CART)
     world = true_world(CART, goal, lambda x, phi: 0.1 * jnp.array([1.0, 0, 0]), jnp.zeros(0), jnp.zeros(2))
-    found = episodes(world, lambda seen: jnp.zeros((1, 1), seen.dtype), jax.random.key(0), 1, 6)
+    found = episodes(world, reflex(lambda seen: jnp.zeros((1, 1), seen.dtype)), jax.random.key(0), 1, 6)
     assert float(found.returns[0]) == 3
     np.testing.assert_allclose(found.encoded[:, 0, 0], [0, 0.1, 0.2, 0.3, 0.3, 0.3, 0.3], atol=1e-6)
     assert not found.succeeded(1)[0]  # it did not live to the end
@@ -251,7 +252,10 @@ def probe(reward: Any, dim_o: int = 1, length: int = 1, signs: bool = False) -> 
         earned = reward(situation.encoded[:, 0], action[:, 0], over)
         return Step(after, Judged(earned.astype(jnp.float32), over, over), jnp.zeros_like(over))
 
-    return World(reset, lambda key, s: s.encoded[:, :dim_o] if dim_o == 1 else s.encoded, step, 0)
+    def at(seen: Any) -> Situation:
+        return Situation(seen, jnp.zeros((len(seen), 0, 1)))
+
+    return World(reset, lambda key, s: s.encoded[:, :dim_o] if dim_o == 1 else s.encoded, step, at, 0)
 
 
 def trained(world: World, **changed: Any) -> tuple[Any, Any, SAC]:
@@ -455,7 +459,60 @@ def test_fine_tuning_climbs_the_return() -> None:
     """In a world without memory whose reward is highest where the action is half of what is seen."""
     world = probe(lambda sign, a, over: -((a - 0.5 * sign) ** 2), signs=True)
     actor = Actor(MLP((8,), negative_slope=0.0), 1)
-    begun = Policy(actor.init(jax.random.key(0), 1, jnp.dtype("float32")), *(jnp.full(1, v, jnp.float32) for v in (0, 1)))
+    begun = Policy(
+        actor.init(jax.random.key(0), 1, jnp.dtype("float32")), *(jnp.full(1, v, jnp.float32) for v in (0, 1))
+    )
     better, returns = fine_tuned(world, actor, begun, jax.random.key(1), 1, 300, 0.02)
     assert float(returns[0]) < -0.05
     np.testing.assert_allclose(actor.act(better, jnp.array([[-1.0], [1.0]], jnp.float32))[:, 0], [-0.5, 0.5], atol=0.03)
+
+
+def test_a_planner_finds_the_action_without_training() -> None:
+    """The reward is highest where the action is half of the sign that is seen."""
+    world = probe(lambda sign, a, over: -((a - 0.5 * sign) ** 2), dim_o=2, signs=True)
+    controller = ICEM(ahead=3, population=64, elites=8, rounds=4).bind(world, 1, 1)
+    seen = jnp.array([[1.0, 1.0], [-1.0, 1.0]], jnp.float32)
+    plan, action = controller.act(jax.random.key(0), controller.begin(2), seen)
+    np.testing.assert_allclose(action[:, 0], [0.5, -0.5], atol=0.08)
+    assert plan.mean.shape == (2, 1, 1)  # no further than the horizon
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[World, Encoding, Task]:
+    """The true pendulum of the swing-up."""
+    node = of_conf("sim", "pendulum_high_fidelity")
+    node["parameters"] |= {"m": 0.6, "l": 0.5, "C_m": 1.1, "c_1": 0.5, "c_2": 0.5}
+    model = build(node, "sim").model()
+    encoding, task = encoding_of(model), build(of_conf("reward", "swing_up"), "reward")
+    step = transition(model, encoding).step
+    world = true_world(encoding, task.bind(encoding), step, jnp.zeros(0, jnp.float32), jnp.zeros(2, jnp.float32))
+    return world, encoding, task
+
+
+def test_a_plan_swings_a_pendulum_up(swing: tuple[World, Encoding, Task]) -> None:
+    world, _, task = swing
+    controller = ICEM(ahead=15, population=64, elites=8, rounds=2).bind(world, task.horizon, 1)
+    planned = episodes(world, controller, jax.random.key(0), 2, 60)
+    idle = episodes(world, reflex(lambda seen: jnp.zeros((2, 1), seen.dtype)), jax.random.key(0), 2, 60)
+    assert float(planned.returns.min()) > 30 > 5 > float(idle.returns.max())
+    assert bool(planned.succeeded(5).all())
+
+
+@pytest.mark.parametrize("ahead", [7, 8])
+@pytest.mark.parametrize("colour", [0.0, 2.0])
+def test_coloured_noise_has_unit_variance(colour: float, ahead: int) -> None:
+    noise = np.asarray(ICEM(colour=colour).coloured(jax.random.key(0), (20_000, ahead, 1)))[:, :, 0]
+    np.testing.assert_allclose(noise.var(axis=0), 1.0, rtol=0.05)
+    alike = np.corrcoef(noise[:, 0], noise[:, 1])[0, 1]
+    assert alike > 0.4 if colour else abs(alike) < 0.03
+
+
+def test_a_planner_in_place_of_a_policy(tmp_path: Path) -> None:
+    small = ("planner.ahead=4", "planner.population=8", "planner.elites=2", "planner.rounds=1", "reward.horizon=12")
+    result = simpel(tmp_path, *SMALL, "planner=icem", *small, "reward.settled=5", "hydra.run.dir=run")
+    assert result.code == 0, result.err
+    assert "plans of 4 steps" in result.out
+    assert not (tmp_path / "run" / "policy").exists()
+    assert (tmp_path / "run" / "episodes.parquet").exists()
+    wrong = simpel(tmp_path, *SMALL, "planner=icem", "planner.elites=500", "hydra.run.dir=wrong")
+    assert "planner.elites: got 500; it is at most planner.population (120)" in wrong.err

@@ -22,8 +22,9 @@ from simpel_cli.nodes import build
 from simpel_cli.records import MetricStream
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
+from simpel_cli.rl.planner import ICEM
 from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import Episodes, episodes
+from simpel_cli.rl.rollout import Episodes, episodes, reflex
 from simpel_cli.rl.sac import SAC, Rule
 from simpel_cli.rl.task import Goal, Task
 from simpel_cli.rl.world import World, beginning_at, learned_world, true_world
@@ -43,6 +44,7 @@ class Assignment(NamedTuple):
         goal: bound to the quantities.
         control: how the policy meets the model.
         policy: how it learns.
+        planner: in its place, plans in the model at every step; None: a policy is learned.
         truth: the true world; None: there is none to judge in.
         truth_name: its name.
     """
@@ -52,6 +54,7 @@ class Assignment(NamedTuple):
     goal: Goal
     control: Control
     policy: SAC
+    planner: ICEM | None
     truth: World | None
     truth_name: str
 
@@ -69,16 +72,16 @@ class Best(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """What training a policy came to.
+    """What training a policy came to, or planning.
 
     Args:
-        policies: the best of every seed, leaves (seeds, ...).
+        policies: the best of every seed, leaves (seeds, ...); None: there is only a plan.
         model_returns: what they earn in the model, per seed.
         seconds: of training.
         compile_seconds: of it.
     """
 
-    policies: Policy
+    policies: Policy | None
     model_returns: np.ndarray
     seconds: float
     compile_seconds: float
@@ -95,6 +98,7 @@ def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
     task = build(config["reward"], "reward", settings.plugins, default=Task)
     control = build(config.get("control") or {}, "control", default=Control)
     policy = build(config["policy"], "policy", settings.plugins, default=SAC)
+    planner = build(config["planner"], "planner", settings.plugins, default=ICEM) if config.get("planner") else None
     source = source_of(config, settings)
     if not source.states:
         raise ConfigError(f"sim: {source.name} has no states, so that there is nothing to control.")
@@ -104,7 +108,7 @@ def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
     if config.get("truth"):
         true = source_of({"sim": config["truth"]}, settings)
         truth, name = _true_world(true, task, goal, encoding), true.name
-    return Assignment(task, encoding, goal, control, policy, truth, name)
+    return Assignment(task, encoding, goal, control, policy, planner, truth, name)
 
 
 def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
@@ -122,6 +126,64 @@ def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
     phi = jnp.asarray([q.middle for q in source.params], jnp.float32)
     noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], jnp.float32)
     return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
+
+
+def _multiple(learned: Learned, asked: Assignment) -> int:
+    """Return what the number of roll-outs in a posterior is a multiple of."""
+    return 1 if asked.control.sampling == "mean" else learned.study.method.particles
+
+
+def _world_at(learned: Learned, asked: Assignment) -> Callable[[tuple[Problem, Any], float], World]:
+    """Return the map from a problem, a posterior's state and a share of roll-outs that begin at data to its world."""
+    study, control = learned.study, asked.control
+    encoding = study.system.encoding
+    if encoding.outputs:
+        measured = ", ".join(q.name for q in encoding.outputs)
+        raise ConfigError(
+            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
+        )
+
+    def world_at(arrays: tuple[Problem, Any], share: float) -> World:
+        problem, state = arrays
+        rule = learned.fitted.bind(problem)
+        noise = rule.predict(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype)).noise_std
+        world = learned_world(
+            encoding, asked.goal, lambda x: rule.members(state, x), noise, study.method.particles, control.sampling,
+            aleatoric=control.aleatoric,
+        )  # fmt: skip
+        return beginning_at(world, encoding, jnp.asarray(problem.x), jnp.asarray(problem.m), share)
+
+    return world_at
+
+
+def plan(learned: Learned, asked: Assignment) -> tuple[Flown, Episodes | None]:
+    """Let a planner act in every seed's posterior and, planning there, in the true world.
+
+    Returns:
+        What it earns in the model, and its episodes in the true world, leaves (seeds, ...).
+    """
+    planner, control, task = asked.planner, asked.control, asked.task
+    assert planner is not None
+    world_at, dim_u = _world_at(learned, asked), len(asked.encoding.inputs)
+    multiple = _multiple(learned, asked)
+    number = -(-control.episodes // multiple) * multiple
+
+    def in_model(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> Float[Array, ""]:
+        world = world_at(arrays, 0.0)
+        return jnp.mean(episodes(world, planner.bind(world, task.horizon, dim_u), key, number, task.horizon).returns)
+
+    def in_truth(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> Episodes:
+        assert asked.truth is not None
+        controller = planner.bind(world_at(arrays, 0.0), task.horizon, dim_u)
+        return episodes(asked.truth, controller, key, control.episodes, task.horizon)
+
+    problems = jax.tree.map(jnp.asarray, (learned.fitted.assembled.problems, learned.state))
+    began = time.perf_counter()
+    earned = jax.jit(jax.vmap(in_model, in_axes=(0, None)))(problems, stream(0, "judge"))
+    judged = None
+    if asked.truth is not None:
+        judged = jax.jit(jax.vmap(in_truth, in_axes=(0, None)))(problems, stream(0, "judge in the truth"))
+    return Flown(None, np.asarray(earned), time.perf_counter() - began, 0.0), judged
 
 
 def train(
@@ -150,22 +212,7 @@ def train(
     sac, control, task = asked.policy, asked.control, asked.task
     study, fitted = learned.study, learned.fitted
     seeds, runs = study.settings.all_seeds, len(study.settings.all_seeds) * sac.policies
-    encoding, dim_u = study.system.encoding, len(study.system.encoding.inputs)
-    if encoding.outputs:
-        measured = ", ".join(q.name for q in encoding.outputs)
-        raise ConfigError(
-            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
-        )
-
-    def world_at(arrays: tuple[Problem, Any], share: float) -> World:
-        problem, state = arrays
-        rule = fitted.bind(problem)
-        noise = rule.predict(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype)).noise_std
-        world = learned_world(
-            encoding, asked.goal, lambda x: rule.members(state, x), noise, study.method.particles, control.sampling,
-            aleatoric=control.aleatoric,
-        )  # fmt: skip
-        return beginning_at(world, encoding, jnp.asarray(problem.x), jnp.asarray(problem.m), share)
+    world_at, dim_u = _world_at(learned, asked), len(study.system.encoding.inputs)
 
     def bind(arrays: tuple[Problem, Any]) -> Rule:
         return sac.bind(world_at(arrays, control.data_share), task.horizon, dim_u)
@@ -174,15 +221,14 @@ def train(
         lambda a: jnp.repeat(jnp.asarray(a), sac.policies, axis=0), (fitted.assembled.problems, learned.state)
     )
     keys = jnp.stack([jax.random.fold_in(stream(s, "policy"), i) for s in seeds for i in range(sac.policies)])
-    multiple = 1 if control.sampling == "mean" else study.method.particles
+    multiple = _multiple(learned, asked)
     iterations = sac.iterations(multiple)
     stretch = max(1, -(-iterations // sac.looks))
     judged = -(-control.episodes // multiple) * multiple
 
     def in_model(arrays: tuple[Problem, Any], policy: Policy, key: PRNGKeyArray) -> tuple[Any, Any]:
-        found = episodes(
-            world_at(arrays, 0.0), lambda seen: bind(arrays).actor.act(policy, seen), key, judged, task.horizon
-        )
+        acting = reflex(lambda seen: bind(arrays).actor.act(policy, seen))
+        found = episodes(world_at(arrays, 0.0), acting, key, judged, task.horizon)
         return jnp.mean(found.returns), jnp.mean(found.broken.astype(jnp.float32))
 
     model_judge = jax.jit(jax.vmap(in_model, in_axes=(0, 0, None)))
@@ -248,7 +294,7 @@ def judge_of(asked: Assignment, dim_u: int) -> Judge:
     actor = sac.bind(world, task.horizon, dim_u).actor
 
     def one(policy: Policy, key: PRNGKeyArray) -> Episodes:
-        return episodes(world, lambda seen: actor.act(policy, seen), key, asked.control.episodes, task.horizon)
+        return episodes(world, reflex(lambda seen: actor.act(policy, seen)), key, asked.control.episodes, task.horizon)
 
     judged: Judge = jax.jit(jax.vmap(one, in_axes=(0, None)))
     return judged

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, train
+from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, plan, train
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.study import resolved, settings_of
 from simpel_cli.config import Job, dump, load
@@ -19,7 +19,16 @@ from simpel_cli.rl.files import contract, save_policy
 from simpel_cli.rl.rollout import Episodes
 from simpel_cli.run import Manifest, configure, make_directory, read_manifest, refuse_occupied, stream
 
-OWN = ("policy", "reward", "truth", "mujoco", "control", "online", "world")  # groups that a fit does not have
+OWN = (
+    "policy",
+    "planner",
+    "reward",
+    "truth",
+    "mujoco",
+    "control",
+    "online",
+    "world",
+)  # groups that a fit does not have
 
 
 def rl_offline(job: Job) -> None:
@@ -61,15 +70,21 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
         "run": directory.name, "command": "rl-offline", "n_train": len(model.fitted.training[0][0])
     }  # fmt: skip
     with MetricStream(directory, constants, resume_at=_done_steps(directory)) as metrics:
-        flown = train(model, asked, terminal, metrics, directory)
+        if asked.planner is None:
+            flown = train(model, asked, terminal, metrics, directory)
+            judged = _in_truth(model, asked, flown)
+        else:
+            flown, judged = plan(model, asked)
         manifest.facts |= {
             "compile_seconds": round(flown.compile_seconds, 3), "policy_seconds": round(flown.seconds, 3),
             "n_train": constants["n_train"],
         }  # fmt: skip
-        judged = _judged(model, asked, flown, directory)
+        if judged is not None:
+            _write_episodes(model, asked, judged, directory)
         metrics.add(_rows(study.settings.all_seeds, asked, flown, judged))
         metrics.close()
-    saved_policies(directory, model, asked, flown)
+    if flown.policies is not None:
+        saved_policies(directory, model, asked, flown)
     _publish(config, terminal, model, asked, flown, judged, directory)
 
 
@@ -100,18 +115,25 @@ def _task_line(asked: Assignment) -> str:
     where = (
         f"judged in {asked.truth_name}" if asked.truth is not None else "no true world to judge in (truth: a simulator)"
     )
-    return (
-        f"{asked.task.horizon} steps   {asked.policy.policies} policies of {asked.policy.steps} steps each, "
-        f"sampling {asked.control.sampling}   {where}"
-    )
+    return f"{asked.task.horizon} steps   {_learner(asked)}, sampling {asked.control.sampling}   {where}"
 
 
-def _judged(model: Learned, asked: Assignment, flown: Flown, directory: Path) -> Episodes | None:
-    """Judge the policies in the true world and write their episodes."""
-    if asked.truth is None:
+def _learner(asked: Assignment) -> str:
+    if asked.planner is not None:
+        return f"plans of {asked.planner.ahead} steps"
+    return f"{asked.policy.policies} policies of {asked.policy.steps} steps each"
+
+
+def _in_truth(model: Learned, asked: Assignment, flown: Flown) -> Episodes | None:
+    """Judge the policies in the true world."""
+    if asked.truth is None or flown.policies is None:
         return None
+    return judge_of(asked, len(model.study.system.encoding.inputs))(flown.policies, stream(0, "judge in the truth"))
+
+
+def _write_episodes(model: Learned, asked: Assignment, found: Episodes, directory: Path) -> None:
+    """Write every transition in the true world."""
     encoding = model.study.system.encoding
-    found = judge_of(asked, len(encoding.inputs))(flown.policies, stream(0, "judge in the truth"))
     runs, steps, number = found.reward.shape
     states = np.asarray(encoding.decode(found.encoded))[:, 1:]
     low, high = np.array(asked.goal.low), np.array(asked.goal.high)
@@ -128,13 +150,13 @@ def _judged(model: Learned, asked: Assignment, flown: Flown, directory: Path) ->
     columns |= {"counts": np.asarray(found.lived).ravel()}
     units = {q.name: q.unit for q in (*encoding.states, *encoding.inputs)}
     write_table(directory / "episodes.parquet", columns, units)
-    return found
 
 
 def _rows(seeds: list[int], asked: Assignment, flown: Flown, judged: Episodes | None) -> list[dict[str, Any]]:
     rows = []
     for i, seed in enumerate(seeds):
-        base = {"seed": seed, "step": asked.policy.steps, "split": "test", "output": "", "unit": "1"}
+        steps = asked.policy.steps if asked.planner is None else 0
+        base = {"seed": seed, "step": steps, "split": "test", "output": "", "unit": "1"}
         rows.append(base | {"metric": "return_in_model", "value": float(flown.model_returns[i])})
         if judged is not None:
             own = _of_run(judged, i)
@@ -178,8 +200,9 @@ def _publish(
             f"seed {row[0]}: return in the model {row[1]}, in the truth {row[2]}, succeeded {row[4]}", "judged"
         )
     images = draw_control(directory, asked.task.horizon) if study.settings.figures else []
+    run = f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed"
     commands = [
-        f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed",
+        *([run] if flown.policies is not None else []),
         f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
     ]
     note = (
@@ -191,11 +214,15 @@ def _publish(
         directory / "report.html",
         title=f"simpel rl-offline · {study.settings.name} · {study.choices.get('method', '')}",
         lead=f"{len(model.fitted.training[0][0])} transitions of {study.recording.files[0].name}, "
-        f"{asked.policy.policies} policies per seed, of which the best in the model is kept.",
+        + (
+            f"{asked.policy.policies} policies per seed, of which the best in the model is kept."
+            if asked.planner is None
+            else f"planned {asked.planner.ahead} steps ahead in the model; no policy is learned."
+        ),
         sections=[{"title": "Returns", "head": head, "rows": rows, "note": note}, *(figure(path) for path in images)],
         commands=commands,
         config=dump(config),
     )
     terminal.line(str(report), "report")
-    for label, line in zip(["next", ""], commands, strict=True):
+    for label, line in zip(["next", ""], commands, strict=False):
         terminal.line(f"{'' if label else ' ' * 10}{line}", label)

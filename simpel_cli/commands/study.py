@@ -23,7 +23,7 @@ from simpel_cli.run import Settings, configure, stream
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
 GROUPS = (
     "run", "sim", "data", "prior", "score", "method", "evaluation", "simulation", "effect", "discovery", "policy", "control",
-    "reward", "truth", "mujoco", "online",
+    "reward", "truth", "mujoco", "online", "planner",
 )  # fmt: skip
 
 

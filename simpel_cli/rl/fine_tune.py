@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.nets import Layers
 from simpel_cli.rl.policy import Actor, Policy
-from simpel_cli.rl.rollout import episodes
+from simpel_cli.rl.rollout import episodes, reflex
 from simpel_cli.rl.world import World
 
 CLIP = 1.0  # of the gradient's norm: through a contact or a spin it is of any size
@@ -46,7 +46,7 @@ def fine_tuned(
 
     def loss(layers: Layers, key: PRNGKeyArray) -> Float[Array, ""]:
         own = policy._replace(layers=layers)
-        return -jnp.mean(episodes(world, lambda seen: actor.act(own, seen), key, number, horizon).returns)
+        return -jnp.mean(episodes(world, reflex(lambda seen: actor.act(own, seen)), key, number, horizon).returns)
 
     def step(carry: tuple[Layers, Any], key: PRNGKeyArray) -> tuple[tuple[Layers, Any], Float[Array, ""]]:
         layers, state = carry

@@ -14,7 +14,7 @@ from simpel_cli.errors import DataError
 from simpel_cli.records import write_table
 from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import Episodes, episodes
+from simpel_cli.rl.rollout import Episodes, episodes, reflex
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Goal
 from simpel_cli.rl.world import World
@@ -106,7 +106,7 @@ class Simulated:
 
         def one(policy: Policy, key: PRNGKeyArray) -> Episodes:
             # a step more than counts: its observation is that of the last state
-            return episodes(world, lambda seen: act(policy, seen), key, 1, horizon + 1)
+            return episodes(world, reflex(lambda seen: act(policy, seen)), key, 1, horizon + 1)
 
         self._run = jax.jit(one)
 

@@ -1,4 +1,4 @@
-"""Episodes of a deterministic policy in a world: what it earns, where it ends."""
+"""Episodes of a controller in a world: what it earns, where it ends."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -41,32 +41,44 @@ class Episodes(NamedTuple):
         return jnp.all(self.good[-settled:] & self.lived[-settled:], axis=0)
 
 
-def episodes(
-    world: World,
-    act: Callable[[Float[Array, "B do"]], Float[Array, "B du"]],
-    key: PRNGKeyArray,
-    number: int,
-    horizon: int,
-) -> Episodes:
+class Controller(NamedTuple):
+    """What acts on observations, and may remember.
+
+    Args:
+        begin: number of episodes -> what it remembers at their beginning.
+        act: (key, what it remembers, observations) -> what it then remembers, and actions.
+    """
+
+    begin: Callable[[int], Any]
+    act: Callable[[PRNGKeyArray, Any, Float[Array, "B do"]], tuple[Any, Float[Array, "B du"]]]
+
+
+def reflex(act: Callable[[Float[Array, "B do"]], Float[Array, "B du"]]) -> Controller:
+    """Return the controller that remembers nothing."""
+    return Controller(lambda number: (), lambda key, memory, seen: (memory, act(seen)))
+
+
+def episodes(world: World, controller: Controller, key: PRNGKeyArray, number: int, horizon: int) -> Episodes:
     """Run B episodes; traceable. An episode that ended stays where it is and earns nothing."""
     key_reset, key_steps = jax.random.split(key)
     first = world.reset(key_reset, number)
 
     def one(carry: Any, key: PRNGKeyArray) -> Any:
-        situation, alive, broken = carry
-        key_see, key_step = jax.random.split(key)
+        situation, alive, broken, memory = carry
+        key_see, key_step, key_act = jax.random.split(key, 3)
         seen = world.observe(key_see, situation)
-        action = jnp.clip(act(seen), -1.0, 1.0)
+        memory, chosen = controller.act(key_act, memory, seen)
+        action = jnp.clip(chosen, -1.0, 1.0)
         after = world.step(key_step, situation, action)
         reward = jnp.where(alive, after.judged.reward, 0.0)
         kept = jax.tree.map(
             lambda a, b: jnp.where(alive.reshape(number, *[1] * (a.ndim - 1)), a, b), after.situation, situation
         )
         row = (kept.encoded, seen, action, reward, after.judged.good & alive, alive)
-        return (kept, alive & ~after.judged.over, broken | (after.broken & alive)), row
+        return (kept, alive & ~after.judged.over, broken | (after.broken & alive), memory), row
 
-    start = (first, jnp.ones(number, bool), jnp.zeros(number, bool))
-    (_, _, broken), (encoded, *rest) = jax.lax.scan(one, start, jax.random.split(key_steps, horizon))
+    start = (first, jnp.ones(number, bool), jnp.zeros(number, bool), controller.begin(number))
+    (_, _, broken, _), (encoded, *rest) = jax.lax.scan(one, start, jax.random.split(key_steps, horizon))
     seen, action, reward, good, lived = rest
     states = jnp.concatenate([first.encoded[None], encoded])
     return Episodes(states, seen, action, reward, good, lived, broken)

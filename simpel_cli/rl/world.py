@@ -54,6 +54,7 @@ class World(NamedTuple):
         reset: (key, n) -> initial situations; no command has been given.
         observe: (key, situations) -> observations, (B, do).
         step: (key, situations, actions in [-1, 1]) -> what they lead to.
+        at: observations without noise -> the situations that show them.
         memory: commands of the past that are kept.
         multiple: B has to be a multiple of it.
     """
@@ -61,6 +62,7 @@ class World(NamedTuple):
     reset: Callable[[PRNGKeyArray, int], Situation]
     observe: Callable[[PRNGKeyArray, Situation], Float[Array, "B do"]]
     step: Callable[[PRNGKeyArray, Situation, Float[Array, "B du"]], Step]
+    at: Callable[[Float[Array, "B do"]], Situation]
     memory: int
     multiple: int = 1
 
@@ -93,6 +95,9 @@ def world_of(
             seen = encoding.encode(states + noise)
         return jnp.concatenate([seen, situation.past.reshape(len(seen), -1)], axis=1)
 
+    def at(seen: Float[Array, "B do"]) -> Situation:
+        return Situation(seen[:, : encoding.dim_state], seen[:, encoding.dim_state :].reshape(len(seen), memory, dim_u))
+
     def step(key: PRNGKeyArray, situation: Situation, action: Float[Array, "B du"]) -> Step:
         command = goal.command(action.astype(situation.encoded.dtype))
         n = len(command)
@@ -107,7 +112,7 @@ def world_of(
         reward = jnp.where(broken, jnp.zeros_like(judged.reward), judged.reward)
         return Step(kept, judged._replace(reward=reward, over=judged.over | broken), broken)
 
-    return World(reset, observe, step, memory, multiple)
+    return World(reset, observe, step, at, memory, multiple)
 
 
 def true_world(
@@ -181,7 +186,7 @@ def beginning_at(
         at = x[jax.random.randint(key_rows, (n,), 0, count, jnp.int32)].astype(fresh.encoded.dtype)
         stacked = at[:, encoding.dim_state :].reshape(n, encoding.stack + 1, len(encoding.inputs))
         past = stacked[:, :-1] if world.memory == encoding.stack else fresh.past
-        measured = jax.random.bernoulli(key_share, share, (n,))
+        measured = jax.random.bernoulli(key_share, share, (n,)) & (count > 0)
         return Situation(
             jnp.where(measured[:, None], at[:, : encoding.dim_state], fresh.encoded),
             jnp.where(measured[:, None, None], past, fresh.past),

@@ -11,7 +11,6 @@ the return through the simulator, from the best look on.
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from simpel_cli import loop
 from simpel_cli.nodes import build
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import episodes
+from simpel_cli.rl.rollout import Controller, episodes, reflex
 from simpel_cli.rl.sac import SAC, Rule
 from simpel_cli.rl.world import World, true_world
 from simpel_cli.run import Settings, configure
@@ -69,8 +68,8 @@ def main() -> None:
     def policy_of(state: Any) -> Policy:
         return bind(None).policy(jax.tree.map(lambda a: a[0], state))
 
-    def acting(policy: Policy) -> Callable[[jax.Array], jax.Array]:
-        return lambda seen: bind(None).actor.act(policy, seen)
+    def acting(policy: Policy) -> Controller:
+        return reflex(lambda seen: bind(None).actor.act(policy, seen))
 
     improved = jax.jit(
         lambda policy, key: fine_tuned(world, bind(None).actor, policy, key, task.horizon, asked.fine_tune, 1e-3)
