@@ -81,7 +81,9 @@ def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
         if plane:
             axes[0].plot(table["x"], table["y"], label=label, **style)
         for axis, name in zip(axes[plane:], names, strict=True):
-            axis.plot(table["t"], table[name], label=None if plane else label, **style)
+            # an angle runs on: a jump by a turn is none
+            course = np.unwrap(table[name]) if units[name] == "rad" else table[name]
+            axis.plot(table["t"], course, label=None if plane else label, **style)
     if plane:
         axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
         axes[0].set(title="paths", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]))
