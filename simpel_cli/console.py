@@ -43,8 +43,9 @@ class Terminal:
         shown = f"{label:<10}{text}" if label else text
         self.console.print(shown, style=style, markup=False, soft_wrap=True)
         if shown and self.log is not None:
+            now = datetime.now()
             with self.log.open("a") as file:
-                file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shown}\n")
+                file.write(f"{now:%Y-%m-%d %H:%M:%S},{now.microsecond // 1000:03d} {shown}\n")
 
     @contextmanager
     def progress(self, label: str, total: int, start: int) -> Iterator[Any]:

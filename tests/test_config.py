@@ -76,7 +76,7 @@ def test_an_experiment_serves_every_verb(tmp_path: Path) -> None:
     searched = compose(tmp_path, "discover", *words)
     assert (searched["close"], searched["discovery"]["rows"]) == (False, 7)
     assert compose(tmp_path, "discover", *words, "close=true")["close"] is True
-    result = simpel(tmp_path, "fit", *words, "data.n_train=0")  # that far and no further: its own mistake is told
+    result = simpel(tmp_path, "fit", *words, "data.n_train=-1")  # that far and no further: its own mistake is told
     assert "data.n_train" in result.err
     result = simpel(tmp_path, "fit", *words, "+discovery.lanes=3")
     assert "discovery: no such key or group of `simpel fit`" in result.err

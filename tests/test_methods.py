@@ -434,6 +434,22 @@ ALIKE = ("map", "repulsive", "svgd", "sysid", "gp")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in EVERY])
+def test_of_no_data_nothing_is_learned(name: str) -> None:
+    """Values in the padding change nothing, and nothing is divided by their number."""
+    problem = problem_of(1.3 * X, kappa=0.3)._replace(m=jnp.int32(0))
+    setting = setting_of(prior_of(gap=True)._replace(draws=70))
+
+    @jax.jit
+    def mean(y: jax.Array) -> jax.Array:
+        rule = EVERY[name].bind(setting, problem._replace(y=y))
+        return rule.predict(run(rule, 6), jnp.asarray(X)).mean
+
+    found = mean(problem.y)
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(found, mean(7 - 3 * problem.y))
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in EVERY])
 def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_zero(name: str) -> None:
     method, seeds = EVERY[name], 2
 

@@ -90,6 +90,14 @@ def test_paths_of_two_outputs_in_units_of_their_own() -> None:
         np.testing.assert_allclose(h.std(axis=0), np.sqrt(np.diag(spread)), rtol=0.1, atol=0.003)
 
 
+def test_without_data_the_paths_are_those_of_the_prior() -> None:
+    _, targets = drawn(rule_of(MANY, problem_of(noisy(), KAPPA)._replace(m=jnp.int32(0))))
+    at, h = np.asarray(targets.x)[:32], np.asarray(targets.h)[:, :32, 0]
+    spread = law(at, at)
+    np.testing.assert_allclose(h.mean(axis=0), 0, atol=0.05 * np.sqrt(spread.max()))
+    np.testing.assert_allclose(np.cov(h.T), spread, atol=0.06 * spread.max())
+
+
 def test_gaps_of_two_outputs_are_different_functions() -> None:
     problem = problem_of(noisy(), KAPPA)
     both = problem._replace(

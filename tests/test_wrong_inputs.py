@@ -175,7 +175,7 @@ CASES = [
     own("nothing moves", DATA, "nothing moves: s, v are constant",
         measurements=csv([[*row[:2], 1, 1, row[4]] for row in swing()])),
     own("more than there is", DATA, "data.n_train: 100000 training transitions are asked for", extra=("data.n_train=100000",)),
-    own("no transitions", CONFIG, "data.n_train: 0 is not allowed", extra=("data.n_train=0",)),
+    own("no transitions", CONFIG, "data.n_train: -1 is not allowed", extra=("data.n_train=-1",)),
     own("split column missing", DATA, "column 'part' is missing", "data.split.column",
         data=RIG.replace("{test_fraction: 0.25, by: episode}", "{column: part}")),
     own("fraction above one", CONFIG, "data.split.test_fraction: 2 is not allowed", extra=("data.split.test_fraction=2",)),

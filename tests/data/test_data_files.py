@@ -154,7 +154,7 @@ def test_test_files_that_do_not_fit(tmp_path: Path, test_files: list[str], messa
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"path": []}, r"data\.path: .* is not allowed"),
+        ({"path": ["a.csv", ""]}, r"data\.path: .* is not allowed"),
         ({"path": ["a.csv"], "split": {"test_files": "a.csv"}}, r"test_files: 'a\.csv' is not a list of files"),
         ({"path": "a.csv", "split": {"test_files": ["a.csv"], "by": "time"}}, r"data\.split: .* is not allowed, only"),
     ],

@@ -228,7 +228,7 @@ def test_latin1_is_named(tmp_path: Path) -> None:
     [
         ({"layout": "trajectory"}, "data.layout: 'trajectory' is not allowed.*Did you mean trajectories"),
         ({"choice": "best"}, "data.choice"),
-        ({"n_train": 0}, "data.n_train: 0"),
+        ({"n_train": -1}, "data.n_train: -1"),
         ({"resample": -1.0}, "data.resample: -1.0"),
         ({"resample": 0.1}, "data.resample.*data.time"),
         ({"noise_std": {"phi": 0}}, "data.noise_std.phi: 0"),
