@@ -193,7 +193,7 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     policy_in(tmp_path / "policy", encoding, task, 0)
     said: list[str] = []
     folder = tmp_path / "rig"
-    exchange = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, said.append)
+    exchange = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, "mine", said.append)
     target, own = folder / "episode_002.parquet", folder / "episode_002"
 
     def rig() -> None:
@@ -226,12 +226,15 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     assert len(list(folder.glob("*.refused-*.parquet"))) == 4
     assert "waiting for" in said[0]
     np.testing.assert_allclose(exchange.ride(2, tmp_path / "policy").states, ride.states)  # still there: taken again
+    other = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, "another", said.append)
+    with pytest.raises(DataError, match=r"is there, but this run did not ask for it"):
+        other.ride(2, tmp_path / "policy")
 
 
 def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
     _, encoding, task = swing
     policy_in(tmp_path / "policy", encoding, task, 0)
-    exchange = Exchange(tmp_path / "rig", encoding, task.bind(encoding), HORIZON, 0.1, lambda text: None)
+    exchange = Exchange(tmp_path / "rig", encoding, task.bind(encoding), HORIZON, 0.1, "mine", lambda text: None)
     with pytest.raises(DataError, match=r"did not come within 0.1 s .*--resume"):
         exchange.ride(0, tmp_path / "policy")
     assert (tmp_path / "rig" / "episode_000" / "run_policy.py").exists()

@@ -54,6 +54,9 @@ def rl_online(job: Job) -> None:
     directory = make_directory(job.directory)
     refuse_occupied(directory)
     config = resolved(job)
+    kind, _, rest = str(config.get("world")).partition(":")
+    if kind == "folder" and rest:  # a resumed run may start elsewhere
+        config["world"] = f"folder:{Path(rest).expanduser().absolute()}"
     write_text(directory / "config.yaml", dump(config))
     with Manifest(directory, "rl-online", settings_of(config)) as manifest:
         _run(config, directory, manifest)
@@ -84,7 +87,7 @@ def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
     asked = assignment(config, settings)
     online = build(config.get("online") or {}, "online", default=Online)
     terminal = Terminal(settings.quiet, directory / "run.log")
-    plant = _plant(str(config.get("world")), config, settings, asked, online, terminal)
+    plant = _plant(config, directory.absolute(), settings, asked, online, terminal)
     loop = Loop(config, directory, settings, asked, online, plant, terminal)
     terminal.line(f"simpel rl-online · {settings.name} · seed {settings.seed}", style="bold")
     terminal.line(
@@ -99,13 +102,19 @@ def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
 
 
 def _plant(
-    world: str, config: dict[str, Any], settings: Settings, asked: Assignment, online: Online, terminal: Terminal
+    config: dict[str, Any],
+    directory: Path,
+    settings: Settings,
+    asked: Assignment,
+    online: Online,
+    terminal: Terminal,
 ) -> Plant:
     """Return what `world` names.
 
     Raises:
         ConfigError: no such world, or what it needs is missing.
     """
+    world = str(config.get("world"))
     kind, _, rest = world.partition(":")
     encoding, horizon, key = asked.encoding, asked.task.horizon, stream(settings.seed, "plant")
     if kind == "sim" and not rest:
@@ -128,8 +137,15 @@ def _plant(
     if kind == "gymnasium" and rest:
         return Stepped(GymnasiumRig(rest, encoding, settings.seed), encoding, asked.goal, horizon)
     if kind == "folder" and rest:
-        folder = Path(rest).expanduser().absolute()
-        return Exchange(folder, encoding, asked.goal, horizon, online.wait, lambda text: terminal.line(text, "rig"))
+        return Exchange(
+            Path(rest),
+            encoding,
+            asked.goal,
+            horizon,
+            online.wait,
+            str(directory),
+            lambda text: terminal.line(text, "rig"),
+        )
     hint = did_you_mean(kind, ["sim", "mujoco", "gymnasium", "folder"])
     raise ConfigError(f"world: got {world!r}; allowed are {WORLDS}.{hint}")
 

@@ -35,27 +35,40 @@ class Exchange:
         goal: of the task.
         horizon: steps of an episode; rows beyond them are not looked at.
         wait: s, until it gives up.
+        run: whose exchange this is: an answer that another run asked for is none.
         say: where a line for the user goes.
     """
 
     def __init__(
-        self, folder: Path, encoding: Encoding, goal: Goal, horizon: int, wait: float, say: Callable[[str], None]
+        self,
+        folder: Path,
+        encoding: Encoding,
+        goal: Goal,
+        horizon: int,
+        wait: float,
+        run: str,
+        say: Callable[[str], None],
     ) -> None:
         self.folder, self.encoding, self.goal, self.horizon = folder, encoding, goal, horizon
-        self.wait, self.say = wait, say
+        self.wait, self.run, self.say = wait, run, say
 
     def ride(self, number: int, policy: Path) -> Ride:
         """Hand out the policy and wait for the episode; see `Plant`.
 
         Raises:
-            DataError: none came in time. Nothing is lost: resume.
+            DataError: none came in time. Nothing is lost: resume. Or there is one that this run did not ask for.
         """
         name = f"episode_{number:03d}"
-        answer = self.folder / f"{name}.parquet"
+        answer, asked = self.folder / f"{name}.parquet", self.folder / name / "request.json"
+        request = {"format": "simpel episode 1", "run": self.run, "answer": answer.name, "rows": self.horizon + 1}
+        if not _is(asked, request):
+            if answer.exists():
+                raise DataError(
+                    f"{answer} is there, but this run did not ask for it. Use an empty folder, or move it away."
+                )
+            shutil.copytree(policy, asked.parent, dirs_exist_ok=True)
+            write_text(asked, json.dumps(request, indent=1))
         if not answer.exists():
-            shutil.copytree(policy, self.folder / name, dirs_exist_ok=True)
-            request = {"format": "simpel episode 1", "answer": answer.name, "rows": self.horizon + 1}
-            write_text(self.folder / name / "request.json", json.dumps(request, indent=1))
             self.say(f"waiting for {answer} ({self.horizon + 1} rows; the policy lies in {self.folder / name})")
         end = time.monotonic() + self.wait
         while True:
@@ -111,6 +124,13 @@ class Exchange:
         if len(bad):
             raise DataError(f"{path.name}, row {bad[0]}: {name} is {values[bad[0]]}, not a finite number.")
         return values
+
+
+def _is(path: Path, request: dict[str, Any]) -> bool:
+    try:
+        return bool(json.loads(path.read_text()) == request)
+    except (OSError, ValueError):
+        return False
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
