@@ -271,6 +271,9 @@ def test_the_run_holds_what_is_promised(driven: Path) -> None:
         r["n_train"] for i in range(3) for r in read_metrics(driven / "rounds" / f"{i:03d}" / "metrics.parquet")[:1]
     ]
     assert learned == [0, 12, 24]
+    judged = simpel(driven, "evaluate", "rounds/002/posterior", "data=pendulum_swing_up", "hydra.run.dir=judged")
+    assert judged.code == 0, judged.err
+    assert "new to the fit" in judged.out
     assert by["nll_before", 2] < by["nll_before", 0]  # what was measured helps
 
 

@@ -78,7 +78,9 @@ def _new_measurements(
         ConfigError: other quantities were measured.
     """
     choices = config["choices"] | {"data": own["choices"].get("data", "")}
-    other = _opened_whole(config | {"choices": choices}, own["data"], job.data_folder)
+    # the past inputs of the fit, where the new data do not say otherwise
+    data = {"stack_actions": config["data"].get("stack_actions") or 0} | own["data"]
+    other = _opened_whole(config | {"choices": choices}, data, job.data_folder)
     if other.system.encoding != study.system.encoding:
         raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
     recording = other.recording

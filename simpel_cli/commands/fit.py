@@ -57,13 +57,14 @@ def resume(directory: Path) -> None:
         _run(config, directory, directory, manifest, resume=True)
 
 
-def learned(config: dict[str, Any], directory: Path, data_folder: Path) -> Learned:
+def learned(config: dict[str, Any], directory: Path, data_folder: Path, *, shown: bool = True) -> Learned:
     """Return the posterior of a fit in a directory of its own: what is complete is read, what is not is gone on with.
 
     Args:
         config: resolved, of `simpel fit`.
         directory: of the fit.
         data_folder: of the data YAML.
+        shown: whether the terminal says what `simpel fit` says; `run.log` does in any case.
     """
     begun = (directory / "manifest.json").exists()
     record = read_manifest(directory) if begun else {}
@@ -76,16 +77,18 @@ def learned(config: dict[str, Any], directory: Path, data_folder: Path) -> Learn
     make_directory(directory)
     write_text(directory / "config.yaml", dump(config))
     with Manifest(directory, "fit", settings_of(config), inputs=dict(inputs)) as manifest:
-        return _run(config, directory, data_folder, manifest, resume=begun)
+        return _run(config, directory, data_folder, manifest, resume=begun, shown=shown)
 
 
-def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool) -> Learned:
+def _run(
+    config: dict[str, Any], directory: Path, data_folder: Path, manifest: Manifest, *, resume: bool, shown: bool = True
+) -> Learned:
     study = open_study(config, data_folder)
     if resume:
         refuse_changed_inputs({"inputs_sha256": manifest.inputs}, study.recording.files)
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
-    terminal = Terminal(study.settings.quiet, directory / "run.log")
+    terminal = Terminal(study.settings.quiet or not shown, directory / "run.log")
     fitted = prepare(study)
     checked = look_at_prior(study, fitted)
     describe(terminal, study, fitted, checked)

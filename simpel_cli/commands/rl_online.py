@@ -165,7 +165,7 @@ def _episode(loop: Loop, number: int) -> None:
         return
     make_directory(folder)
     began = time.perf_counter()
-    model = learned(_fit_config(loop, number), folder / "posterior", loop.directory)
+    model = learned(_fit_config(loop, number), folder / "posterior", loop.directory, shown=False)
     fitted = time.perf_counter()
     flown = _trained(loop, number, model, folder)
     trained = time.perf_counter()
@@ -202,7 +202,6 @@ def _fit_config(loop: Loop, number: int) -> dict[str, Any]:
     own = {key: value for key, value in config["data"].items() if key in MEASURED}
     paths = [str(_file(loop, i)) for i in range(number)]
     config["data"] = own | {"path": paths, "time": "t", "split": {"test_fraction": 0}}
-    config["run"] = config["run"] | {"quiet": True, "figures": False}
     return config
 
 
