@@ -361,7 +361,7 @@ def test_a_damaged_policy_is_refused(tmp_path: Path) -> None:
 SMALL = (
     "rl-offline", "experiment=pendulum_swing_up", "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]",
     "method.pool=64", "prior.draws=64", "policy.steps=4000", "policy.environments=8", "policy.policies=2", "policy.looks=4",
-    "policy.hidden=[16]", "control.episodes=4", "run.seeds=2",
+    "policy.hidden=[16]", "control.episodes=4", "control.fine_tune=3", "run.seeds=2",
 )  # fmt: skip
 
 
@@ -388,7 +388,7 @@ def test_the_run_holds_what_is_promised(flown: Path) -> None:
     rows = read_metrics(flown / "metrics.parquet")
     assert {r["metric"] for r in rows if r["split"] == "test"} == {"return_in_model", "return_in_truth", "success"}
     looks = {r["step"] for r in rows if r["split"] == "train"}
-    assert len(looks) == 4
+    assert len(looks) == 5  # and what fine-tuning came to
     assert {r["seed"] for r in rows} == {0, 1}
 
 

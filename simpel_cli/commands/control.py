@@ -274,17 +274,24 @@ def train(
             true = in_truth(now)
             metrics.add(_rows(seeds, sac.policies, one.step * per, np.asarray(earned), np.asarray(broken), true))
             keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
-            note = f"return in the model {float(best.returns.max()):.4g}"
-            update(one.step, note + (f", in the truth {true.max():.4g}" if true is not None else ""))
+            update(one.step, _said(best, true))
     assert best is not None
     if control.fine_tune:
         began_tuning = jnp.stack([jax.random.fold_in(key, sac.policies) for key in keys])
-        tuned = jax.jit(jax.vmap(improved))(problems, best.policy, began_tuning)
-        earned, broken = model_judge(problems, tuned, stream(0, "judge"))
-        at = iterations * per + control.fine_tune
-        metrics.add(_rows(seeds, sac.policies, at, np.asarray(earned), np.asarray(broken), in_truth(tuned)))
-        best = _better(best, Best(tuned, earned))
+        with terminal.progress(f"fine-tuning {label}", control.fine_tune, 0) as update:
+            tuned = jax.jit(jax.vmap(improved))(problems, best.policy, began_tuning)
+            earned, broken = model_judge(problems, tuned, stream(0, "judge"))
+            true = in_truth(tuned)
+            at = iterations * per + control.fine_tune
+            metrics.add(_rows(seeds, sac.policies, at, np.asarray(earned), np.asarray(broken), true))
+            best = _better(best, Best(tuned, earned))
+            update(control.fine_tune, _said(best, true))
     return _of_seeds(best, len(seeds), sac.policies, time.perf_counter() - began, program.compile_seconds)
+
+
+def _said(best: Best, true: np.ndarray | None) -> str:
+    note = f"return in the model {float(best.returns.max()):.4g}"
+    return note + (f", in the truth {true.max():.4g}" if true is not None else "")
 
 
 def judge_of(asked: Assignment, dim_u: int) -> Judge:

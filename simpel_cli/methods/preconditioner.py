@@ -17,6 +17,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from simpel_cli.eigen import eigh
+
 
 class Basis(NamedTuple):
     """Eigenvalues and eigenvectors of the prior's covariance of every output: taken once for a set of points."""
@@ -27,7 +29,7 @@ class Basis(NamedTuple):
 
 def basis(covariance: Float[Array, "dy k k"], dtype: jnp.dtype) -> Basis:
     """Return the eigenbasis of covariances, taken in float64; no direction is amplified, so that `dtype` may be less."""
-    values, vectors = jnp.linalg.eigh(covariance.astype(jnp.float64))
+    values, vectors = eigh(covariance.astype(jnp.float64))
     return Basis(jnp.maximum(values, 0.0).astype(dtype), vectors.astype(dtype))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from simpel_cli.eigen import eigh
 from simpel_cli.errors import ConfigError
 
 KERNELS = ("squared_exponential", "imq")
@@ -76,5 +77,5 @@ def subspace(matrix: Float[Array, "P P"], rank: int, key: Array, passes: int = 2
     basis = jnp.linalg.qr(matrix @ start)[0]
     for _ in range(passes):
         basis = jnp.linalg.qr(matrix @ basis)[0]
-    values, vectors = jnp.linalg.eigh(basis.T @ matrix @ basis)
+    values, vectors = eigh(basis.T @ matrix @ basis)
     return values[::-1], (basis @ vectors)[:, ::-1]

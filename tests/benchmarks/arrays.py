@@ -6,12 +6,13 @@ have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 24 + 16 points, the refere
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
 import yaml
 from jaxtyping import Array, Key
+from omegaconf import OmegaConf
 
 from simpel_cli.config import conf_dir, recordings_dir
 from simpel_cli.inference import Method, Normaliser
@@ -68,8 +69,9 @@ def sets() -> list[str]:
 
 def node(group: str, name: str) -> dict[str, Any]:
     """Return a YAML of conf/ without its defaults."""
-    given = yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
-    return {k: v for k, v in given.items() if k != "defaults"}
+    given = OmegaConf.load(conf_dir() / group / f"{name}.yaml")
+    resolved = cast("dict[str, Any]", OmegaConf.to_container(given, resolve=True))
+    return {k: v for k, v in resolved.items() if k != "defaults"}
 
 
 def prior_of(method: str, scale: str | float, draws: int) -> SimulatorPrior | GPPrior:

@@ -1,6 +1,8 @@
 """Soft actor-critic on the true parking car: returns and time.
 
-    python -m tests.benchmarks.control [--seeds 3] [--steps 500000] [--fine-tune 300] [--starts 16]
+    python -m tests.benchmarks.control [--seeds 3] [--fine-tune 100] [--starts 16] [batch=256 ...]
+
+Words set what stands in conf/policy/sac.yaml.
 
 Trained one after the other, 20 looks at the same 256 episodes, deterministic; the best look counts. The ceiling is what
 trajectory optimisation reaches: from each of `--starts` initial states, without noise, the commands of all steps are
@@ -22,6 +24,7 @@ import yaml
 
 from simpel_cli import loop
 from simpel_cli.nodes import build
+from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.rollout import Controller, episodes, reflex
@@ -41,15 +44,17 @@ def main() -> None:
     """Train, judge and print."""
     parser = argparse.ArgumentParser(prog="tests.benchmarks.control", description=__doc__)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=500_000)
-    parser.add_argument("--fine-tune", type=int, default=300)
+    parser.add_argument("words", nargs="*")
+    parser.add_argument("--fine-tune", type=int, default=Control.fine_tune)
     parser.add_argument("--starts", type=int, default=16)
     asked = parser.parse_args()
     configure(Settings())
     node = lambda *parts: yaml.safe_load(CONF.joinpath(*parts).read_text())  # noqa: E731
     model = build(node("sim", "parking_car.yaml"), "sim").model()
     task = build(node("reward", "parking.yaml"), "reward")
-    sac = SAC(steps=asked.steps, policies=1)
+    words = dict(word.split("=", 1) for word in asked.words)
+    policy = node("policy", "sac.yaml") | {"policies": 1} | {key: yaml.safe_load(value) for key, value in words.items()}
+    sac: SAC = build(policy, "policy")
     encoding = encoding_of(model, stack=3)
     goal, one = task.bind(encoding), transition(model, encoding).step
     noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in encoding.states], jnp.float32)
@@ -72,7 +77,9 @@ def main() -> None:
         return reflex(lambda seen: bind(None).actor.act(policy, seen))
 
     improved = jax.jit(
-        lambda policy, key: fine_tuned(world, bind(None).actor, policy, key, task.horizon, asked.fine_tune, 1e-3)
+        lambda policy, key: fine_tuned(
+            world, bind(None).actor, policy, key, task.horizon, asked.fine_tune, Control.fine_tune_rate
+        )
     )
     iterations = sac.iterations(1)
     updates = iterations * round(sac.updates * sac.environments * sac.collect)
@@ -107,7 +114,7 @@ def main() -> None:
             policies.append(better)
 
     quiet = true_world(encoding, goal, one, jnp.zeros(0, jnp.float32), jnp.zeros_like(noise))
-    for horizon in HORIZONS:
+    for horizon in HORIZONS if asked.starts else ():
         flown = [episodes(quiet, acting(p), jax.random.key(5), asked.starts, horizon) for p in policies]
         began = time.perf_counter()
         found = ceiling(quiet, jnp.stack([f.action for f in flown]), asked.starts, horizon)
