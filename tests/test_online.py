@@ -17,6 +17,10 @@ import pytest
 import yaml
 from command_line import ROOT, simpel
 
+from simpel_cli.commands.control import assignment, world_of_posterior
+from simpel_cli.commands.fit import learned
+from simpel_cli.commands.study import settings_of
+from simpel_cli.config import load
 from simpel_cli.data import Measurements, read
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError, DataError
@@ -24,13 +28,15 @@ from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.records import read_metrics, write_table
 from simpel_cli.rl.exchange import Exchange
-from simpel_cli.rl.files import contract, save_policy
+from simpel_cli.rl.files import contract, load_policy, save_policy
 from simpel_cli.rl.plant import Simulated, Stepped, write_ride
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
+from simpel_cli.rl.rollout import episodes, reflex
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Task
-from simpel_cli.rl.world import true_world
+from simpel_cli.rl.world import World, true_world
+from simpel_cli.run import stream
 from simpel_cli.transition import encoding_of, transition
 
 HORIZON = 12
@@ -275,6 +281,28 @@ def test_the_run_holds_what_is_promised(driven: Path) -> None:
     assert judged.code == 0, judged.err
     assert "new to the fit" in judged.out
     assert by["nll_before", 2] < by["nll_before", 0]  # what was measured helps
+
+
+def test_no_policy_earns_less_in_the_model_than_the_one_before(driven: Path) -> None:
+    """A training that ends in a local optimum costs no episode: what is acted by is at least as good there as what was."""
+    config = load(driven / "config.yaml")
+    settings = settings_of(config)
+    asked = assignment(config, settings)
+    for number in (1, 2):
+        folder = driven / "rounds" / f"{number:03d}"
+        model = learned(load(folder / "posterior" / "config.yaml"), folder / "posterior", driven, shown=False)
+        arrays = jax.tree.map(lambda a: jnp.asarray(a)[0], (model.fitted.assembled.problems, model.state))
+        world = world_of_posterior(model, asked)(arrays, 0.0)
+        actor = asked.policy.bind(world, asked.task.horizon, len(asked.encoding.inputs)).actor
+
+        def earned(folder: Path, world: World = world, actor: Actor = actor) -> float:
+            policy, _ = load_policy(folder / "policy")
+            acting = reflex(lambda seen: actor.act(policy, seen))
+            return float(episodes(world, acting, stream(0, "judge"), 4, asked.task.horizon).returns.mean())
+
+        promised = json.loads((folder / "round.json").read_text())["return_in_model"]
+        np.testing.assert_allclose(promised, earned(folder), rtol=1e-3, atol=1e-3)
+        assert promised >= earned(driven / "rounds" / f"{number - 1:03d}") - 1e-3
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_end(driven: Path, tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def _multiple(learned: Learned, asked: Assignment) -> int:
     return 1 if asked.control.sampling == "mean" else learned.study.method.particles
 
 
-def _world_at(learned: Learned, asked: Assignment) -> Callable[[tuple[Problem, Any], float], World]:
+def world_of_posterior(learned: Learned, asked: Assignment) -> Callable[[tuple[Problem, Any], float], World]:
     """Return the map from a problem, a posterior's state and a share of roll-outs that begin at data to its world."""
     study, control = learned.study, asked.control
     encoding = study.system.encoding
@@ -164,7 +164,7 @@ def plan(learned: Learned, asked: Assignment) -> tuple[Flown, Episodes | None]:
     """
     planner, control, task = asked.planner, asked.control, asked.task
     assert planner is not None
-    world_at, dim_u = _world_at(learned, asked), len(asked.encoding.inputs)
+    world_at, dim_u = world_of_posterior(learned, asked), len(asked.encoding.inputs)
     multiple = _multiple(learned, asked)
     number = -(-control.episodes // multiple) * multiple
 
@@ -195,6 +195,7 @@ def train(
     *,
     label: str = "policy",
     before: Path | None = None,
+    rival: Policy | None = None,
 ) -> Flown:
     """Train policies in every seed's posterior; the best of each seed, by what it earns in the model, is kept.
 
@@ -208,11 +209,12 @@ def train(
         directory: of the checkpoint.
         label: of the progress bar.
         before: directory of a training on another posterior, whose policies and critics this one begins with.
+        rival: a policy that is kept, and fine-tuned, in place of those that earn less in the model.
     """
     sac, control, task = asked.policy, asked.control, asked.task
     study, fitted = learned.study, learned.fitted
     seeds, runs = study.settings.all_seeds, len(study.settings.all_seeds) * sac.policies
-    world_at, dim_u = _world_at(learned, asked), len(study.system.encoding.inputs)
+    world_at, dim_u = world_of_posterior(learned, asked), len(study.system.encoding.inputs)
 
     def bind(arrays: tuple[Problem, Any]) -> Rule:
         return sac.bind(world_at(arrays, control.data_share), task.horizon, dim_u)
@@ -276,6 +278,9 @@ def train(
             keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
             update(one.step, _said(best, true))
     assert best is not None
+    if rival is not None:
+        own = jax.tree.map(lambda a, b: jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape), rival, best.policy)
+        best = _better(best, Best(own, model_judge(problems, own, stream(0, "judge"))[0]))
     if control.fine_tune:
         began_tuning = jnp.stack([jax.random.fold_in(key, sac.policies) for key in keys])
         with terminal.progress(f"fine-tuning {label}", control.fine_tune, 0) as update:

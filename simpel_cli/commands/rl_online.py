@@ -22,6 +22,7 @@ from simpel_cli.plots.control import draw_online
 from simpel_cli.records import MetricStream, load_checkpoint, read_metrics, write_metrics, write_text
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.exchange import Exchange
+from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.online import Online
 from simpel_cli.rl.plant import Plant, Simulated, Stepped, write_ride
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
@@ -207,7 +208,9 @@ def _fit_config(loop: Loop, number: int) -> dict[str, Any]:
 
 def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
     """Train the policy of an episode."""
-    before = _folder(loop, number - 1) if loop.online.warm_start and number else None
+    last = _folder(loop, number - 1) if number else None
+    before = last if loop.online.warm_start else None
+    rival = load_policy(last / "policy")[0] if last is not None and loop.online.keep_better else None
     done = folder / "checkpoint" / "state.safetensors"
     constants = model.study.constants | {
         "run": f"{loop.directory.name}/{number:03d}", "command": "rl-online",
@@ -215,7 +218,9 @@ def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
     }  # fmt: skip
     at = int(load_checkpoint(folder / "checkpoint")[1]["world_steps"]) if done.exists() else None
     with MetricStream(folder, constants, resume_at=at) as metrics:
-        flown = train(model, loop.asked, loop.terminal, metrics, folder, label=f"policy {number}", before=before)
+        flown = train(
+            model, loop.asked, loop.terminal, metrics, folder, label=f"policy {number}", before=before, rival=rival
+        )
         metrics.close()
     saved_policies(folder, model, loop.asked, flown)
     return flown

@@ -12,11 +12,14 @@ class Online:
     Args:
         episodes: in the plant.
         warm_start: a policy is trained from where the one of the episode before ended; else from nothing.
+        keep_better: the policy of the episode before goes on where it earns more in the new model than the new one does: a
+            training that ended in a local optimum costs no episode.
         wait: s, for an episode of a rig behind a folder.
     """
 
     episodes: int = 10
     warm_start: bool = False
+    keep_better: bool = True
     wait: float = 3600.0
 
     def __post_init__(self) -> None:
