@@ -19,7 +19,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.rl.files import contract, load_policy, save_policy
-from simpel_cli.rl.fine_tune import fine_tuned
+from simpel_cli.rl.fine_tune import fading, fine_tuned
 from simpel_cli.rl.planner import ICEM
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Transitions, batches, empty, put
@@ -462,9 +462,31 @@ def test_fine_tuning_climbs_the_return() -> None:
     begun = Policy(
         actor.init(jax.random.key(0), 1, jnp.dtype("float32")), *(jnp.full(1, v, jnp.float32) for v in (0, 1))
     )
-    better, returns = fine_tuned(world, actor, begun, jax.random.key(1), 1, 300, 0.02)
+    better, returns = fine_tuned(world, actor, begun, jax.random.key(1), 1, 300, 0.02, 20.0)
     assert float(returns[0]) < -0.05
     np.testing.assert_allclose(actor.act(better, jnp.array([[-1.0], [1.0]], jnp.float32))[:, 0], [-0.5, 0.5], atol=0.03)
+
+
+def test_a_gradient_fades_with_the_steps_that_it_goes_back() -> None:
+    """The reward is the sum of all actions so far: what one earns k steps later counts exp(-k/reach) as much."""
+
+    def add(key: Any, situation: Situation, action: Any) -> Step:
+        total = situation.encoded + action
+        never = jnp.zeros(len(action), bool)
+        return Step(situation._replace(encoded=total), Judged(total[:, 0], never, never), never)
+
+    world = probe(None)._replace(step=add, observe=lambda key, situation: situation.encoded)
+    kept, steps = float(np.exp(-1 / 4.0)), 5
+
+    def returns(shift: jax.Array, world: World) -> jax.Array:
+        acting = reflex(lambda seen: jnp.full((len(seen), 1), 0.1, jnp.float32) + shift)
+        return episodes(world, acting, jax.random.key(0), 2, steps).returns.mean()
+
+    zero = jnp.zeros((), jnp.float32)
+    slopes = [float(jax.grad(returns)(zero, w)) for w in (world, fading(world, 4.0))]
+    expected = [sum(share ** (t - k) for t in range(steps) for k in range(t + 1)) for share in (1.0, kept)]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-5)
+    np.testing.assert_allclose(returns(zero, world), returns(zero, fading(world, 4.0)), rtol=1e-6)
 
 
 def test_a_planner_finds_the_action_without_training() -> None:

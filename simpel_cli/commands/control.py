@@ -251,6 +251,7 @@ def train(
             task.horizon,
             control.fine_tune,
             control.fine_tune_rate,
+            control.fine_tune_reach,
         )[0]
 
     program = loop.compiled(bind, problems, keys, stretch)

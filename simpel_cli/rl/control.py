@@ -19,6 +19,7 @@ class Control:
         fine_tune: steps of gradient ascent on the return in the model, from the best look on; it climbs the model's errors,
             too. What does not earn more in the model is not kept.
         fine_tune_rate: of Adam at the start, along a cosine.
+        fine_tune_reach: steps within which what an action leads to fades from the gradient, by a factor of e.
         precondition: what `method.precondition` is where it is not set. Networks that follow the gradient have after 5000
             steps left out what the simulator says in few directions of many inputs, such as that steering turns the car:
             good enough for one step ahead, and nothing to drive by.
@@ -30,6 +31,7 @@ class Control:
     episodes: int = 100
     fine_tune: int = 100
     fine_tune_rate: float = 3e-3
+    fine_tune_reach: float = 20.0
     precondition: bool = True
 
     def __post_init__(self) -> None:
@@ -41,5 +43,6 @@ class Control:
         check_at_least_one("control", self, ("episodes",))
         if self.fine_tune < 0:
             raise ConfigError(f"control.fine_tune: got {self.fine_tune}; it must be 0 (off) or more.")
-        if not self.fine_tune_rate > 0:
-            raise ConfigError(f"control.fine_tune_rate: got {self.fine_tune_rate}; it must be positive.")
+        for name in ("fine_tune_rate", "fine_tune_reach"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"control.{name}: got {getattr(self, name)}; it must be positive.")

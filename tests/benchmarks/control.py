@@ -78,7 +78,14 @@ def main() -> None:
 
     improved = jax.jit(
         lambda policy, key: fine_tuned(
-            world, bind(None).actor, policy, key, task.horizon, asked.fine_tune, Control.fine_tune_rate
+            world,
+            bind(None).actor,
+            policy,
+            key,
+            task.horizon,
+            asked.fine_tune,
+            Control.fine_tune_rate,
+            Control.fine_tune_reach,
         )
     )
     iterations = sac.iterations(1)
