@@ -56,6 +56,7 @@ class Job(typing.NamedTuple):
     directory: Path
     data_folder: Path  # folder of the data YAML: relative paths of measurements start there
     words: str = ""  # the overrides that tell this job from the others of a sweep
+    given: tuple[str, ...] = ()  # all overrides, as typed
 
 
 class _Stopped(BaseException):
@@ -102,7 +103,8 @@ def launch(
             if config_dir is not None and "choices" in plain:
                 plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with
             given = [w.removeprefix("++") for w in hydra_config.overrides.task]
-            return task(Job(plain, directory, folder, " ".join(w for w in given if w.partition("=")[0] in swept)))
+            told = " ".join(w for w in given if w.partition("=")[0] in swept)
+            return task(Job(plain, directory, folder, told, tuple(given)))
         except Exception as error:
             raise _Stopped from error
 

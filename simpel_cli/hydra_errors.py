@@ -105,6 +105,11 @@ def _interpolation(text: str, key: str) -> str:
         return f"${{{found[1]}:...}} is unknown; allowed are {known}."
     if found := re.search(r"ConfigError raised while resolving interpolation: (.+)", text):
         return found[1]
+    if "Cannot merge" in text and "ListConfig" in text:
+        return (
+            "a list and a mapping cannot be merged. Take away what stands there, then give yours: "
+            f"'~{key}' '+{key}=...'."
+        )
     if "Missing mandatory value" in text:
         return f"a value must be given (the YAML says ???), e.g. on the command line: {key}=VALUE."
     if found := re.search(r"(?:no viable alternative|mismatched|token recognition).*?'(\$\{.*)'", text):

@@ -164,6 +164,16 @@ def interruption() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def stop_if(interrupted: threading.Event) -> None:
+    """Stop between two pieces of work, of which each keeps what it came to.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM came meanwhile.
+    """
+    if interrupted.is_set():
+        raise Interrupted("stopped; what is complete is kept.")
+
+
 def _refuse_non_finite(info: Any, start: int) -> None:
     """Name the first step and quantity that is not finite."""
     first: tuple[int, str, int] | None = None

@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simpel_cli.errors import ConfigError, DataError, Interrupted, NumericsError, SimpelError
+from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.records import write_text
 
 if TYPE_CHECKING:
@@ -120,7 +120,12 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-STATUS = {Interrupted: "interrupted", NumericsError: "failed", DataError: "failed", ConfigError: "failed"}
+RESUMED = ("fit", "rl-offline", "rl-online")  # verbs whose runs can be gone on with
+COMPUTED = (
+    "checkpoint",
+    "*.safetensors",
+    "episodes/*.parquet",
+)  # of which a run directory has one once it has a result
 
 
 @dataclass
@@ -212,14 +217,15 @@ def refuse_occupied(directory: Path, key: str = "hydra.run.dir") -> None:
     if not (directory / "manifest.json").exists():
         return
     record = read_manifest(directory)
-    if record.get("status") == "failed" and not (directory / "checkpoint").exists():
+    if record.get("status") == "failed" and not any(any(directory.rglob(name)) for name in COMPUTED):
         return
-    go_on = f"Go on with `simpel fit --resume {directory}`, or choose" if record["command"] == "fit" else "Choose"
+    verb = record["command"]
+    go_on = f"Go on with `simpel {verb} --resume {directory}`, or choose" if verb in RESUMED else "Choose"
     raise ConfigError(f"{key}: {directory} holds a run already. {go_on} another directory; nothing was changed.")
 
 
-def make_directory(path: Path, key: str = "hydra.run.dir") -> Path:
-    """Create a directory that the key names, and prove that it can be written.
+def make_directory(path: Path, key: str = "hydra.run.dir", cure: str = "") -> Path:
+    """Create a directory that the key names, and prove that it can be written; the cure is KEY=DIR, or as said.
 
     Raises:
         ConfigError: it cannot.
@@ -231,7 +237,7 @@ def make_directory(path: Path, key: str = "hydra.run.dir") -> Path:
         probe.unlink()
     except OSError as error:
         raise ConfigError(
-            f"{key}: cannot write to {path} ({error.strerror}). Choose another place: {key}=DIR."
+            f"{key}: cannot write to {path} ({error.strerror}). Choose another place: {cure or f'{key}=DIR'}."
         ) from error
     return path
 

@@ -19,7 +19,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.rl.files import contract, load_policy, save_policy
-from simpel_cli.rl.fine_tune import fading, fine_tuned
+from simpel_cli.rl.fine_tune import fading, fine_tuned, finite
 from simpel_cli.rl.planner import ICEM
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Transitions, batches, empty, put
@@ -89,7 +89,11 @@ def test_initial_states_follow_their_laws() -> None:
             {"limits": {"u": [-3, 1]}},
             r"reward.limits.u: got \[-3, 1\]; allowed are low < high within the declared range",
         ),
-        ({"settled": 11}, r"reward.settled: got 11; it is at most reward.horizon \(10\)"),
+        ({"initial": {"s": ["a", "b"]}}, r"reward.initial.s: got \['a', 'b'\]; write a number"),
+        ({"initial": {"s": {"mean": 0, "std": "x"}}}, "reward.initial.s: got .*; write a number"),
+        ({"initial": {"s": float("nan")}}, "reward.initial.s: got nan; write a number"),
+        ({"noise_std": {"s": -1.0}}, "reward.noise_std.s: got -1.0; it must be 0 or more, and finite"),
+        ({"settled": 11, "success": "s > 0"}, r"reward.settled: got 11; it is at most reward.horizon \(10\)"),
         ({"horizon": 0}, "reward.horizon: got 0; it must be at least 1"),
     ],
 )
@@ -183,6 +187,30 @@ def test_what_is_not_finite_ends_an_episode_and_stays_out_of_the_state() -> None
     assert found.broken.tolist() == [True, False]
     assert found.lived.sum(axis=0).tolist() == [1, 10]
     np.testing.assert_allclose(found.returns, [0, 5.5], rtol=1e-5)
+
+
+def test_breaking_a_model_never_pays() -> None:
+    """Where rewards are negative, an episode that the world could not go on with earns the least of all at every step."""
+    goal = Task(reward="-1 - u**2", horizon=10).bind(CART)
+    world = true_world(
+        CART, goal, lambda x, phi: jnp.where(x[-1] > 3.0, jnp.nan, 0.1) * jnp.ones(3), jnp.zeros(0), jnp.zeros(2)
+    )
+    found = episodes(world, reflex(lambda seen: jnp.array([[1.0], [1 / 3]], seen.dtype)), jax.random.key(0), 2, 10)
+    assert found.broken.tolist() == [True, False]
+    np.testing.assert_allclose(found.returns, [-50, -50], rtol=1e-5)
+
+
+def test_a_policy_does_not_learn_to_break_the_model() -> None:
+    """Every step costs something, and the world breaks where the action is positive: a policy that did so would save it."""
+    whole = probe(lambda sign, a, over: -1 - 0.1 * a**2, length=10**6)
+
+    def step(key: Any, situation: Situation, action: Any) -> Step:
+        after, broken = whole.step(key, situation, action), action[:, 0] > 0
+        judged = after.judged._replace(reward=jnp.where(broken, 0.0, after.judged.reward), over=broken)
+        return Step(after.situation, judged, broken)
+
+    rule, state, _ = trained(whole._replace(step=step), discount=0.8, target_entropy=-2.0, episode=5)
+    assert float(rule.actor.act(rule.policy(state), jnp.ones((1, 1), jnp.float32))[0, 0]) < -0.2
 
 
 def test_stop_ends_an_episode_and_nothing_is_earned_after_it() -> None:
@@ -320,6 +348,8 @@ def test_a_horizon_is_no_end() -> None:
         ({"steps": 0}, "policy.steps: got 0; it must be at least 1"),
         ({"discount": 1.5}, "policy.discount: got 1.5; it must be above 0 and at most 1"),
         ({"learning_rate": 0.0}, "policy.learning_rate: got 0.0; it must be positive"),
+        ({"final_learning_rate": -1.0}, "policy.final_learning_rate: got -1.0; allowed are 0 to 1"),
+        ({"target_entropy": float("nan")}, "policy.target_entropy: got nan; it must be a finite number"),
         ({"clip": -1.0}, "policy.clip: got -1.0; it must be positive, or null"),
     ],
 )
@@ -386,7 +416,12 @@ def test_the_run_holds_what_is_promised(flown: Path) -> None:
     ):
         assert (flown / name).exists(), name
     rows = read_metrics(flown / "metrics.parquet")
-    assert {r["metric"] for r in rows if r["split"] == "test"} == {"return_in_model", "return_in_truth", "success"}
+    assert {r["metric"] for r in rows if r["split"] == "test"} == {
+        "return_in_model",
+        "return_in_truth",
+        "success",
+        "broken_in_model",
+    }
     looks = {r["step"] for r in rows if r["split"] == "train"}
     assert len(looks) == 5  # and what fine-tuning came to
     assert {r["seed"] for r in rows} == {0, 1}
@@ -489,6 +524,11 @@ def test_a_gradient_fades_with_the_steps_that_it_goes_back() -> None:
     np.testing.assert_allclose(returns(zero, world), returns(zero, fading(world, 4.0)), rtol=1e-6)
 
 
+def test_a_gradient_that_is_not_finite_is_left_out() -> None:
+    slope = (jnp.array([1.0, jnp.nan]), jnp.array([-jnp.inf, 2.0]))
+    np.testing.assert_array_equal(jnp.stack(finite(slope)), [[1.0, 0.0], [0.0, 2.0]])
+
+
 def test_a_planner_finds_the_action_without_training() -> None:
     """The reward is highest where the action is half of the sign that is seen."""
     world = probe(lambda sign, a, over: -((a - 0.5 * sign) ** 2), dim_o=2, signs=True)
@@ -497,6 +537,21 @@ def test_a_planner_finds_the_action_without_training() -> None:
     plan, action = controller.act(jax.random.key(0), controller.begin(2), seen)
     np.testing.assert_allclose(action[:, 0], [0.5, -0.5], atol=0.08)
     assert plan.mean.shape == (2, 1, 1)  # no further than the horizon
+
+
+def test_a_plan_is_good_on_the_whole_and_not_by_a_lucky_particle() -> None:
+    """Two particles that disagree on the sign of what the input does: the best that is known is to do nothing."""
+    goal = Task(reward="s - 0.1*u**2", horizon=1, limits={"u": [-2, 2]}).bind(CART)
+
+    def members(x: jax.Array) -> jax.Array:
+        signs = jnp.array([1.0, -1.0], x.dtype)[:, None, None]
+        return signs * x[:, :, -1:] * jnp.array([1.0, 0.0, 0.0], x.dtype)[None, None]
+
+    world = learned_world(CART, goal, members, jnp.full(3, 1e-9), 2, "tsinf")
+    controller = ICEM(ahead=1, population=64, elites=8, rounds=4).bind(world, 1, 1)
+    seen = world.observe(jax.random.key(0), world.reset(jax.random.key(0), 2))
+    _, action = controller.act(jax.random.key(0), controller.begin(2), seen)
+    np.testing.assert_allclose(action, 0.0, atol=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from simpel_cli.nodes import build
 from simpel_cli.records import read_metrics, write_table
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import contract, load_policy, save_policy
-from simpel_cli.rl.plant import Simulated, Stepped, write_ride
+from simpel_cli.rl.plant import Ride, Simulated, Stepped, earned, write_ride
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
 from simpel_cli.rl.rollout import episodes, reflex
@@ -109,19 +109,21 @@ def test_the_mujoco_car_is_driven(tmp_path: Path) -> None:
     goal = task.bind(encoding)
     policy_in(tmp_path, encoding, task, 3)
     world = build(of_conf("sim", "rc_car_world"), "sim").model()
-    rig = WorldRig(world, encoding, goal, np.zeros(6), jax.random.key(0))
+    rig = WorldRig(world, encoding, goal, model.dt, np.zeros(6), jax.random.key(0))
     ride = Stepped(rig, encoding, goal, HORIZON).ride(0, tmp_path)
     assert ride.states.shape == (HORIZON + 1, 6)
     low, high = np.array(goal.low), np.array(goal.high)
     assert ((ride.commands >= low) & (ride.commands <= high)).all()
     moved = np.hypot(*(ride.states - ride.states[0])[:, :2].T)
     assert moved[2] < 0.01 < moved[-1]  # nothing arrives within the first three steps
-    noisy = WorldRig(world, encoding, goal, np.full(6, 0.1), jax.random.key(0))
+    noisy = WorldRig(world, encoding, goal, model.dt, np.full(6, 0.1), jax.random.key(0))
     assert 0.01 < np.abs(noisy.reset(0) - rig.reset(0)).max() < 0.5
     np.testing.assert_array_equal(noisy.reset(1), noisy.reset(1))
     bare = encoding_of(build(of_conf("sim", "pendulum"), "sim").model())
     with pytest.raises(ConfigError, match=r"states of rc_car_world are x, y, .*; those of sim are phi, omega"):
-        WorldRig(world, bare, goal, np.zeros(2), jax.random.key(0))
+        WorldRig(world, bare, goal, model.dt, np.zeros(2), jax.random.key(0))
+    with pytest.raises(ConfigError, match=r"a step of rc_car_world is 0\.0333.* s; one of sim is 0\.05 s"):
+        WorldRig(world, encoding, goal, 0.05, np.zeros(6), jax.random.key(0))
 
 
 class Cart:
@@ -170,6 +172,45 @@ def test_a_gymnasium_environment_is_driven(
     assert ride.reward.shape == ride.good.shape == (steps,)
 
 
+def test_what_a_plant_earns_does_not_depend_on_turns(swing: tuple[Any, Encoding, Task]) -> None:
+    """A rig counts its turns; the task has angles in [-pi, pi)."""
+    _, encoding, task = swing
+    goal, states, commands = task.bind(encoding), np.array([[0.3, 1.0], [-0.2, 0.5]]), np.array([[0.1], [-0.4]])
+    turned = states + np.array([[4 * np.pi, 0.0]])
+    for one, two in zip(
+        earned(goal, encoding, states, commands), earned(goal, encoding, turned, commands), strict=True
+    ):
+        np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+def test_a_command_before_counts_at_every_step(swing: tuple[Any, Encoding, Task]) -> None:
+    """Judged step by step, as a stepped rig is, or all at once: the same."""
+    _, encoding, _ = swing
+    goal = Task(reward="u_before", horizon=10, stop="u_before > 0.5").bind(encoding)
+    states, commands = np.zeros((3, 2)), np.array([[0.6], [0.2], [0.1]])
+    whole = earned(goal, encoding, states, commands)
+    assert whole[2].tolist() == [False, True, False]
+    last = earned(goal, encoding, states[1:2], commands[1:2], commands[0])
+    assert (float(last[0][0]), bool(last[2][0])) == (float(whole[0][1]), True)
+
+
+def test_a_simulator_that_cannot_go_on_ends_the_episode(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    """The step that it could not take is no measurement."""
+    _, encoding, task = swing
+    goal = task.bind(encoding)
+    actor = policy_in(tmp_path, encoding, task, 0)
+
+    def step(x: jax.Array, phi: jax.Array) -> jax.Array:
+        turned = jnp.arctan2(x[0], x[1])
+        return jnp.array([0.0, 0.0, 1.0], x.dtype) + jnp.where(x[2] > 3.5, jnp.nan, 0.0).astype(x.dtype) * turned
+
+    world = true_world(encoding, goal, step, jnp.zeros(0), jnp.zeros(2, jnp.float32))
+    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).ride(0, tmp_path)
+    speeds = ride.states[:, 1]
+    assert 2 <= len(speeds) <= 6
+    np.testing.assert_allclose(np.diff(speeds), 1.0, atol=1e-5)
+
+
 @pytest.mark.usefixtures("gymnasium")
 def test_an_environment_that_cannot_be_used(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
     _, encoding, task = swing
@@ -179,6 +220,17 @@ def test_an_environment_that_cannot_be_used(swing: tuple[Any, Encoding, Task], t
     rig = GymnasiumRig("breaks_at_once", encoding, 0)
     with pytest.raises(DataError, match="no step was possible"):
         Stepped(rig, encoding, task.bind(encoding), HORIZON).ride(0, tmp_path)
+
+
+def anything(number: int, ride: Ride) -> None:
+    """Accept every episode."""
+
+
+def exchange_of(
+    folder: Path, encoding: Encoding, task: Task, wait: float, run: str, said: list[str], accept: Any = anything
+) -> Exchange:
+    goal = task.bind(encoding)
+    return Exchange(folder, encoding, goal, HORIZON, 0.05, wait, run, accept, said.append, lambda: None)
 
 
 def answer_of(folder: Path, rows: int) -> dict[str, Any]:
@@ -199,7 +251,14 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     policy_in(tmp_path / "policy", encoding, task, 0)
     said: list[str] = []
     folder = tmp_path / "rig"
-    exchange = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, "mine", said.append)
+    refused: list[int] = []
+
+    def accept(number: int, ride: Ride) -> None:
+        if not refused:
+            refused.append(number)
+            raise DataError("a fit can make nothing of it")
+
+    exchange = exchange_of(folder, encoding, task, 60.0, "mine", said, accept)
     target, own = folder / "episode_002.parquet", folder / "episode_002"
 
     def rig() -> None:
@@ -212,27 +271,37 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
             "u is 1e+09": good | {"u": np.full(HORIZON + 1, 1e9)},
             "the column omega is missing": {k: v for k, v in good.items() if k != "omega"},
             "1 rows": {k: v[:1] for k, v in good.items()},
+            "t is 0.1 s": good | {"t": 0.1 * np.arange(HORIZON + 1)},
+            "a fit": good,
         }
         for i, columns in enumerate(wrong.values(), 1):
             write_table(target, columns)
             while not (folder / f"episode_002.refused-{i}.txt").exists():
                 time.sleep(0.02)
-        write_table(target, good)
+        unseen = np.append(good["u"][:-1], np.nan)  # nobody sees what the last command leads to
+        write_table(target, good | {"u": unseen, "t": 7.0 + 0.05 * np.arange(HORIZON + 1)})
 
     thread = threading.Thread(target=rig, daemon=True)
     thread.start()
     ride = exchange.ride(2, tmp_path / "policy")
     thread.join()
     assert ride.states.shape == (HORIZON + 1, 2)
-    problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 5)]
-    for problem, expected in zip(
-        problems, ("row 5: phi is nan", "row 0: u is 1e+09", "the column omega is missing", "1 rows"), strict=True
-    ):
-        assert expected in problem
-    assert len(list(folder.glob("*.refused-*.parquet"))) == 4
+    problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 7)]
+    expected = (
+        "row 5: phi is nan",
+        "row 0: u is 1e+09",
+        "the column omega is missing",
+        "1 rows",
+        "row 1: t is 0.1",
+        "a fit",
+    )
+    for problem, words in zip(problems, expected, strict=True):
+        assert words in problem
+    assert refused == [2]
+    assert len(list(folder.glob("*.refused-*.parquet"))) == 6
     assert "waiting for" in said[0]
     np.testing.assert_allclose(exchange.ride(2, tmp_path / "policy").states, ride.states)  # still there: taken again
-    other = Exchange(folder, encoding, task.bind(encoding), HORIZON, 60.0, "another", said.append)
+    other = exchange_of(folder, encoding, task, 60.0, "another", said)
     with pytest.raises(DataError, match=r"is there, but this run did not ask for it"):
         other.ride(2, tmp_path / "policy")
 
@@ -240,7 +309,7 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
 def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
     _, encoding, task = swing
     policy_in(tmp_path / "policy", encoding, task, 0)
-    exchange = Exchange(tmp_path / "rig", encoding, task.bind(encoding), HORIZON, 0.1, "mine", lambda text: None)
+    exchange = exchange_of(tmp_path / "rig", encoding, task, 0.1, "mine", [])
     with pytest.raises(DataError, match=r"did not come within 0.1 s .*--resume"):
         exchange.ride(0, tmp_path / "policy")
     assert (tmp_path / "rig" / "episode_000" / "run_policy.py").exists()
@@ -294,13 +363,15 @@ def test_no_policy_earns_less_in_the_model_than_the_one_before(driven: Path) -> 
     actor = asked.policy.bind(world, asked.task.horizon, len(asked.encoding.inputs)).actor
 
     @jax.jit
-    def earned(policy: Policy) -> jax.Array:
+    def worth(policy: Policy, key: jax.Array) -> jax.Array:
         acting = reflex(lambda seen: actor.act(policy, seen))
-        return episodes(world, acting, stream(0, "judge"), 4, asked.task.horizon).returns.mean()
+        return episodes(world, acting, key, 4, asked.task.horizon).returns.mean()
 
+    own, last = (load_policy(driven / "rounds" / number / "policy")[0] for number in ("001", "000"))
+    assert float(worth(own, stream(0, "judge"))) >= float(worth(last, stream(0, "judge"))) - 1e-3
+    # what is promised was earned in other episodes than those that it was chosen by
     promised = json.loads((folder / "round.json").read_text())["return_in_model"]
-    np.testing.assert_allclose(promised, earned(load_policy(folder / "policy")[0]), rtol=1e-3, atol=1e-3)
-    assert promised >= float(earned(load_policy(driven / "rounds" / "000" / "policy")[0])) - 1e-3
+    np.testing.assert_allclose(promised, worth(own, stream(0, "judge anew")), rtol=1e-3, atol=1e-3)
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_end(driven: Path, tmp_path: Path) -> None:
@@ -329,7 +400,13 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(driven: Path, tmp_path: P
         (("run.seeds=2",), "rl-online takes one"),
         (("online.episodes=0",), "online.episodes: got 0; it must be at least 1"),
         (("online.warmstart=true",), "online.warmstart: no such key"),
-        (("world=folder:rig", "online.wait=0.1"), "did not come within 0.1 s"),
+        (("world=folder:/proc/rig",), "world: cannot write to"),
+        (("data.n_train=5",), "data.n_train=5: rl-online learns from episodes of its own"),
+        (("data.noise_std.q=1",), "data.noise_std.q: the simulator has no such quantity (it has: phi, omega)"),
+        (
+            ("sim@truth=pendulum_high_fidelity", "sim.dt=0.1"),
+            "truth: a step of pendulum_high_fidelity is 0.05 s; one of sim",
+        ),
     ],
 )
 def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
@@ -337,3 +414,51 @@ def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> No
     assert result.code in (2, 3)
     assert message in result.err
     assert "Traceback" not in result.err
+
+
+CART = {
+    "_target_": "simulators.model.Declared", "name": "cart", "dt": 0.05,
+    "states": {"s": {"unit": "m", "range": [-0.5, 0.5]}, "v": {"unit": "m/s", "range": [-2, 2]}},
+    "inputs": {"u": {"unit": "V", "range": [-3, 3]}},
+    "parameters": {"m": {"unit": "kg", "range": [0.5, 2.0]}, "k": {"unit": "N/m", "range": [5, 50]}, "c": 2.0},
+    "dynamics": {"s": "v", "v": "(c*u - k*s)/m"},
+}  # fmt: skip
+LIFT = {
+    "_target_": "simpel_cli.rl.task.Task", "reward": "1 - (s - 0.2)**2", "initial": {"s": [-0.1, 0.1]}, "horizon": 12,
+    "settled": 5,
+}  # fmt: skip
+
+
+def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
+    """As docs/control.md has it: no data, a simulator and a task; then what became of the run is not overwritten."""
+    for group, name, node in (("sim", "cart", CART), ("reward", "lift", LIFT)):
+        (tmp_path / "my" / group).mkdir(parents=True)
+        (tmp_path / "my" / group / f"{name}.yaml").write_text(yaml.safe_dump(node))
+    small = [word for word in SMALL[2:] if not word.startswith(("reward.", "online."))]
+    words = ("rl-online", "--config-dir", "my", "sim=cart", "reward=lift", "world=folder:exchange", *small)
+    asked, answer = tmp_path / "exchange" / "episode_000", tmp_path / "exchange" / "episode_000.parquet"
+
+    def rig() -> None:
+        while not (asked / "request.json").exists():
+            time.sleep(0.02)
+        runner, rows, s, v = PolicyRunner(asked), [], 0.05, 0.0
+        for _ in range(13):
+            rows.append((s, v, runner.command({"s": s, "v": v})["u"]))
+            s, v = s + 0.05 * v, v + 0.05 * (2 * rows[-1][2] - 20 * s)
+        columns = dict(zip(("s", "v", "u"), np.array(rows).T, strict=True))
+        write_table(answer, {name: np.zeros(13) for name in columns})  # it was switched off
+        while answer.exists():
+            time.sleep(0.02)
+        write_table(tmp_path / "exchange" / "new.parquet", columns)
+        (tmp_path / "exchange" / "new.parquet").rename(answer)
+
+    thread = threading.Thread(target=rig, daemon=True)
+    thread.start()
+    result = simpel(tmp_path, *words, "online.episodes=2", "online.wait=1.5", "hydra.run.dir=run")
+    thread.join()
+    assert "refused: episode_000.parquet: nothing moves" in result.out
+    assert "episode_001.parquet did not come within 1.5 s" in result.err  # the first was taken, the second asked for
+    assert pq.read_table(tmp_path / "run" / "episodes" / "000.parquet").num_rows == 13
+    again = simpel(tmp_path, *words, "online.episodes=2", "policy.steps=8000", "hydra.run.dir=run")
+    assert again.code == 2
+    assert "holds a run already. Go on with `simpel rl-online --resume run`" in again.err

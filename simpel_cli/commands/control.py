@@ -15,11 +15,13 @@ from simpel_cli.commands.checkpoint import keep, restored
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
 from simpel_cli.console import Terminal
+from simpel_cli.data.recording import Source
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
 from simpel_cli.nodes import build
 from simpel_cli.records import MetricStream
+from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.planner import ICEM
@@ -45,6 +47,7 @@ class Assignment(NamedTuple):
         control: how the policy meets the model.
         policy: how it learns.
         planner: in its place, plans in the model at every step; None: a policy is learned.
+        source: the simulator.
         truth: the true world; None: there is none to judge in.
         truth_name: its name.
     """
@@ -55,6 +58,7 @@ class Assignment(NamedTuple):
     control: Control
     policy: SAC
     planner: ICEM | None
+    source: Source
     truth: World | None
     truth_name: str
 
@@ -76,13 +80,15 @@ class Flown(NamedTuple):
 
     Args:
         policies: the best of every seed, leaves (seeds, ...); None: there is only a plan.
-        model_returns: what they earn in the model, per seed.
+        model_returns: what they earn in the model, per seed, in other episodes than those that they were chosen by.
+        broken: share of these episodes with which the model could not go on, per seed.
         seconds: of training.
         compile_seconds: of it.
     """
 
     policies: Policy | None
     model_returns: np.ndarray
+    broken: np.ndarray
     seconds: float
     compile_seconds: float
 
@@ -107,25 +113,33 @@ def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
     truth, name = None, ""
     if config.get("truth"):
         true = source_of({"sim": config["truth"]}, settings)
-        truth, name = _true_world(true, task, goal, encoding), true.name
-    return Assignment(task, encoding, goal, control, policy, planner, truth, name)
+        truth, name = _true_world(true, task, goal, encoding, source.dt), true.name
+    return Assignment(task, encoding, goal, control, policy, planner, source, truth, name)
 
 
-def _true_world(source: Any, task: Task, goal: Goal, own: Encoding) -> World:
+def _true_world(source: Any, task: Task, goal: Goal, own: Encoding, dt: float) -> World:
     if not isinstance(source, Model):
         raise ConfigError(
             f"truth: {source.name} answers queries only; name a simulator with equations, e.g. sim@truth=..."
         )
     encoding = encoding_of(source, stack=own.stack)
-    for what in ("states", "inputs"):
-        have, need = ([q.name for q in getattr(e, what)] for e in (encoding, own))
-        if have != need:
-            raise ConfigError(
-                f"truth: {what} of {source.name} are {', '.join(have)}; those of sim are {', '.join(need)}."
-            )
+    check_comparable("truth", source, own, goal, dt)
     phi = jnp.asarray([q.middle for q in source.params], jnp.float32)
     noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], jnp.float32)
     return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
+
+
+def refuse_outputs(encoding: Encoding) -> None:
+    """Refuse measurements of more than states.
+
+    Raises:
+        ConfigError: names what is measured.
+    """
+    if encoding.outputs:
+        measured = ", ".join(q.name for q in encoding.outputs)
+        raise ConfigError(
+            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
+        )
 
 
 def _multiple(learned: Learned, asked: Assignment) -> int:
@@ -137,11 +151,6 @@ def world_of_posterior(learned: Learned, asked: Assignment) -> Callable[[tuple[P
     """Return the map from a problem, a posterior's state and a share of roll-outs that begin at data to its world."""
     study, control = learned.study, asked.control
     encoding = study.system.encoding
-    if encoding.outputs:
-        measured = ", ".join(q.name for q in encoding.outputs)
-        raise ConfigError(
-            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
-        )
 
     def world_at(arrays: tuple[Problem, Any], share: float) -> World:
         problem, state = arrays
@@ -168,9 +177,10 @@ def plan(learned: Learned, asked: Assignment) -> tuple[Flown, Episodes | None]:
     multiple = _multiple(learned, asked)
     number = -(-control.episodes // multiple) * multiple
 
-    def in_model(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> Float[Array, ""]:
+    def in_model(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> tuple[Any, Any]:
         world = world_at(arrays, 0.0)
-        return jnp.mean(episodes(world, planner.bind(world, task.horizon, dim_u), key, number, task.horizon).returns)
+        found = episodes(world, planner.bind(world, task.horizon, dim_u), key, number, task.horizon)
+        return jnp.mean(found.returns), jnp.mean(found.broken.astype(jnp.float32))
 
     def in_truth(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> Episodes:
         assert asked.truth is not None
@@ -179,11 +189,11 @@ def plan(learned: Learned, asked: Assignment) -> tuple[Flown, Episodes | None]:
 
     problems = jax.tree.map(jnp.asarray, (learned.fitted.assembled.problems, learned.state))
     began = time.perf_counter()
-    earned = jax.jit(jax.vmap(in_model, in_axes=(0, None)))(problems, stream(0, "judge"))
+    earned, broken = jax.jit(jax.vmap(in_model, in_axes=(0, None)))(problems, stream(0, "judge"))
     judged = None
     if asked.truth is not None:
         judged = jax.jit(jax.vmap(in_truth, in_axes=(0, None)))(problems, stream(0, "judge in the truth"))
-    return Flown(None, np.asarray(earned), time.perf_counter() - began, 0.0), judged
+    return Flown(None, np.asarray(earned), np.asarray(broken), time.perf_counter() - began, 0.0), judged
 
 
 def train(
@@ -269,7 +279,7 @@ def train(
         state = sac.begun_with(program.init(problems, keys), last)
     began = time.perf_counter()
     per = sac.side_by_side(multiple) * sac.collect
-    with terminal.progress(label, iterations, start) as update:
+    with loop.interruption() as interrupted, terminal.progress(label, iterations, start) as update:
         for one in loop.train(program, iterations, state=state, start=start):
             now = policies_of(problems, one.state)
             earned, broken = model_judge(problems, now, stream(0, "judge"))
@@ -278,6 +288,7 @@ def train(
             metrics.add(_rows(seeds, sac.policies, one.step * per, np.asarray(earned), np.asarray(broken), true))
             keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
             update(one.step, _said(best, true))
+        loop.stop_if(interrupted)
     assert best is not None
     if rival is not None:
         own = jax.tree.map(lambda a, b: jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape), rival, best.policy)
@@ -292,7 +303,10 @@ def train(
             metrics.add(_rows(seeds, sac.policies, at, np.asarray(earned), np.asarray(broken), true))
             best = _better(best, Best(tuned, earned))
             update(control.fine_tune, _said(best, true))
-    return _of_seeds(best, len(seeds), sac.policies, time.perf_counter() - began, program.compile_seconds)
+    anew = model_judge(problems, best.policy, stream(0, "judge anew"))
+    chosen = np.asarray(best.returns).reshape(len(seeds), -1).argmax(axis=1) + np.arange(len(seeds)) * sac.policies
+    policies, earned, broken = jax.tree.map(lambda a: a[chosen], (best.policy, *map(np.asarray, anew)))
+    return Flown(policies, earned, broken, time.perf_counter() - began, program.compile_seconds)
 
 
 def _said(best: Best, true: np.ndarray | None) -> str:
@@ -317,12 +331,6 @@ def _better(old: Best, new: Best) -> Best:
     """Keep, run by run, what earns more in the model."""
     more = new.returns > old.returns
     return jax.tree.map(lambda a, b: jnp.where(more.reshape(-1, *[1] * (a.ndim - 1)), b, a), old, new)
-
-
-def _of_seeds(best: Best, seeds: int, policies: int, seconds: float, compile_seconds: float) -> Flown:
-    returns = np.asarray(best.returns).reshape(seeds, policies)
-    chosen = returns.argmax(axis=1) + np.arange(seeds) * policies
-    return Flown(jax.tree.map(lambda a: a[chosen], best.policy), returns.max(axis=1), seconds, compile_seconds)
 
 
 def _rows(

@@ -1,16 +1,18 @@
 """`simpel rl-offline`: learn a policy in the posterior of a fit, judge it in the true world."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, plan, train
+from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, plan, refuse_outputs, train
 from simpel_cli.commands.fit import Learned, learned
-from simpel_cli.commands.study import resolved, settings_of
+from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
+from simpel_cli.loop import interruption, stop_if
 from simpel_cli.plots.canvas import with_interval
 from simpel_cli.plots.control import draw_control
 from simpel_cli.records import MetricStream, load_checkpoint, write_table, write_text
@@ -59,7 +61,10 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     configure(settings)
     asked = assignment(config, settings)  # what is wrong with the task is said before the fit
     fit = {key: value for key, value in config.items() if key not in OWN}
-    model = learned(fit, directory / "posterior", data_folder)
+    refuse_outputs(open_study(fit, data_folder).system.encoding)
+    with interruption() as interrupted:
+        model = learned(fit, directory / "posterior", data_folder)
+        stop_if(interrupted)
     study = model.study
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
@@ -158,10 +163,12 @@ def _rows(seeds: list[int], asked: Assignment, flown: Flown, judged: Episodes | 
         steps = asked.policy.steps if asked.planner is None else 0
         base = {"seed": seed, "step": steps, "split": "test", "output": "", "unit": "1"}
         rows.append(base | {"metric": "return_in_model", "value": float(flown.model_returns[i])})
+        rows.append(base | {"metric": "broken_in_model", "value": float(flown.broken[i])})
         if judged is not None:
             own = _of_run(judged, i)
             rows.append(base | {"metric": "return_in_truth", "value": float(np.mean(own.returns))})
-            rows.append(base | {"metric": "success", "value": float(np.mean(own.succeeded(asked.task.settled)))})
+            if asked.task.success:
+                rows.append(base | {"metric": "success", "value": float(np.mean(own.succeeded(asked.task.settled)))})
     return rows
 
 
@@ -184,7 +191,8 @@ def _publish(
         if judged is not None:
             own = _of_run(judged, i)
             returns = np.asarray(own.returns, float)
-            mean, half = float(returns.mean()), 1.96 * float(returns.std(ddof=1)) / len(returns) ** 0.5
+            mean = float(returns.mean())
+            half = 1.96 * float(returns.std(ddof=1)) / len(returns) ** 0.5 if len(returns) > 1 else math.nan
             ends = np.quantile(returns, [0.05, 0.95])
             cells += [
                 with_interval(mean, mean - half, mean + half),
@@ -199,6 +207,9 @@ def _publish(
         terminal.line(
             f"seed {row[0]}: return in the model {row[1]}, in the truth {row[2]}, succeeded {row[4]}", "judged"
         )
+    for seed, share in zip(seeds, flown.broken, strict=True):
+        if share:
+            terminal.line(f"seed {seed}: {100 * share:.0f} % of the roll-outs in the model diverged", "diverged")
     images = draw_control(directory, asked.task.horizon) if study.settings.figures else []
     run = f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed"
     commands = [

@@ -1,7 +1,10 @@
 """`simpel rl-online`: act in the plant, measure, learn a model and a policy, act again."""
 
 import json
+import secrets
+import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,17 +17,18 @@ from simpel_cli.commands.rl_offline import OWN, saved_policies
 from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
-from simpel_cli.data import Measurements, read, transitions
+from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
+from simpel_cli.loop import interruption, stop_if
 from simpel_cli.nodes import build
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online
-from simpel_cli.records import MetricStream, load_checkpoint, read_metrics, write_metrics, write_text
+from simpel_cli.records import MetricStream, load_checkpoint, write_metrics, write_text
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.online import Online
-from simpel_cli.rl.plant import Plant, Simulated, Stepped, write_ride
+from simpel_cli.rl.plant import Plant, Ride, Simulated, Stepped, write_ride
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
 from simpel_cli.run import Manifest, Settings, configure, make_directory, read_manifest, refuse_occupied, stream
 from simulators.model import Model
@@ -46,12 +50,19 @@ class Loop(NamedTuple):
     settings: Settings
     asked: Assignment
     online: Online
-    plant: Plant
     terminal: Terminal
+    check: Callable[[], None]  # raises if the user stopped the run
 
 
 def rl_online(job: Job) -> None:
     """Run in a new directory."""
+    for word in job.given:
+        group, _, key = word.partition("=")[0].lstrip("+").partition(".")
+        if group == "data" and key and key.partition(".")[0] not in MEASURED:
+            raise ConfigError(
+                f"{word}: rl-online learns from episodes of its own; of data: it takes {', '.join(MEASURED)} only. "
+                "To learn from measurements use rl-offline."
+            )
     directory = make_directory(job.directory)
     refuse_occupied(directory)
     config = resolved(job)
@@ -88,43 +99,39 @@ def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
     asked = assignment(config, settings)
     online = build(config.get("online") or {}, "online", default=Online)
     terminal = Terminal(settings.quiet, directory / "run.log")
-    plant = _plant(config, directory.absolute(), settings, asked, online, terminal)
-    loop = Loop(config, directory, settings, asked, online, plant, terminal)
-    terminal.line(f"simpel rl-online · {settings.name} · seed {settings.seed}", style="bold")
-    terminal.line(
-        f"{online.episodes} episodes of {asked.task.horizon} steps in {config['world']}"
-        + (f" ({asked.truth_name})" if config["world"] == "sim" else ""),
-        "task",
-    )
-    for number in range(online.episodes):
-        _episode(loop, number)
+    with interruption() as interrupted:
+        loop = Loop(config, directory, settings, asked, online, terminal, lambda: stop_if(interrupted))
+        plant = _plant(loop)
+        _refuse_wrong_data(loop)
+        terminal.line(f"simpel rl-online · {settings.name} · seed {settings.seed}", style="bold")
+        terminal.line(
+            f"{online.episodes} episodes of {asked.task.horizon} steps in {config['world']}"
+            + (f" ({asked.truth_name})" if config["world"] == "sim" else ""),
+            "task",
+        )
+        for number in range(online.episodes):
+            _episode(loop, plant, number)
     write_metrics(directory / "metrics.parquet", _rows(loop), _constants(loop))
     _publish(loop)
 
 
-def _plant(
-    config: dict[str, Any],
-    directory: Path,
-    settings: Settings,
-    asked: Assignment,
-    online: Online,
-    terminal: Terminal,
-) -> Plant:
+def _plant(loop: Loop) -> Plant:
     """Return what `world` names.
 
     Raises:
         ConfigError: no such world, or what it needs is missing.
     """
+    config, settings, asked = loop.config, loop.settings, loop.asked
     world = str(config.get("world"))
     kind, _, rest = world.partition(":")
-    encoding, horizon, key = asked.encoding, asked.task.horizon, stream(settings.seed, "plant")
+    encoding, goal, horizon, key = asked.encoding, asked.goal, asked.task.horizon, stream(settings.seed, "plant")
     if kind == "sim" and not rest:
         if asked.truth is None:
             raise ConfigError(
                 "world: sim needs a true simulator, e.g. sim@truth=parking_car; for a rig use world=folder:DIR."
             )
         actor = asked.policy.bind(asked.truth, horizon, len(encoding.inputs)).actor
-        return Simulated(asked.truth, encoding, asked.goal, actor.act, horizon, key)
+        return Simulated(asked.truth, encoding, goal, actor.act, horizon, key)
     if kind == "mujoco" and not rest:
         if not config.get("mujoco"):
             raise ConfigError("world: mujoco needs a MuJoCo world, e.g. +sim@mujoco=rc_car_world.")
@@ -134,21 +141,25 @@ def _plant(
                 f"mujoco: {source.name} is a simulator with equations; use it as sim@truth with world=sim."
             )
         noise = np.array([asked.task.noise_std.get(q.name, 0.0) for q in encoding.states])
-        return Stepped(WorldRig(source, encoding, asked.goal, noise, key), encoding, asked.goal, horizon)
+        return Stepped(WorldRig(source, encoding, goal, asked.source.dt, noise, key), encoding, goal, horizon)
     if kind == "gymnasium" and rest:
-        return Stepped(GymnasiumRig(rest, encoding, settings.seed), encoding, asked.goal, horizon)
+        return Stepped(GymnasiumRig(rest, encoding, settings.seed), encoding, goal, horizon)
     if kind == "folder" and rest:
         return Exchange(
-            Path(rest),
-            encoding,
-            asked.goal,
-            horizon,
-            online.wait,
-            str(directory),
-            lambda text: terminal.line(text, "rig"),
-        )
+            make_directory(Path(rest), "world", "world=folder:DIR"), encoding, goal, horizon, asked.source.dt,
+            loop.online.wait, _identity(loop.directory), lambda number, ride: _accept(loop, number, ride),
+            lambda text: loop.terminal.line(text, "rig"), loop.check,
+        )  # fmt: skip
     hint = did_you_mean(kind, ["sim", "mujoco", "gymnasium", "folder"])
     raise ConfigError(f"world: got {world!r}; allowed are {WORLDS}.{hint}")
+
+
+def _identity(directory: Path) -> str:
+    """Return what tells this run's requests to a rig from those of others, wherever its directory is moved."""
+    path = directory / "exchange_id.txt"
+    if not path.exists():
+        write_text(path, secrets.token_hex(16))
+    return path.read_text()
 
 
 def _file(loop: Loop, number: int) -> Path:
@@ -159,7 +170,7 @@ def _folder(loop: Loop, number: int) -> Path:
     return loop.directory / "rounds" / f"{number:03d}"
 
 
-def _episode(loop: Loop, number: int) -> None:
+def _episode(loop: Loop, plant: Plant, number: int) -> None:
     """Learn from the episodes before, act, and keep what came of it. What is complete is not done again."""
     path, folder = _file(loop, number), _folder(loop, number)
     if (folder / "round.json").exists():
@@ -168,15 +179,18 @@ def _episode(loop: Loop, number: int) -> None:
     began = time.perf_counter()
     model = learned(_fit_config(loop, number), folder / "posterior", loop.directory, shown=False)
     fitted = time.perf_counter()
+    loop.check()
     flown = _trained(loop, number, model, folder)
     trained = time.perf_counter()
+    loop.check()
     if not path.exists():
-        ride = loop.plant.ride(number, folder / "policy")
-        write_ride(path, ride, loop.asked.encoding, model.study.system.source.dt)
+        write_ride(path, plant.ride(number, folder / "policy"), loop.asked.encoding, loop.asked.source.dt)
+    problem = _problem(loop, number, path)
     facts = {
         "return_in_model": float(flown.model_returns[0]),
         "nll_before": _surprise(loop, number, model),
-        "broken_in_model": _broken(folder),
+        "broken_in_model": float(flown.broken[0]),
+        "fitted": not problem,
         "fit_seconds": round(fitted - began, 3),
         "policy_seconds": round(trained - fitted, 3),
         "episode_seconds": round(time.perf_counter() - trained, 3),
@@ -195,15 +209,65 @@ def _episode(loop: Loop, number: int) -> None:
         f"fit {facts['fit_seconds']:.0f} s, policy {facts['policy_seconds']:.0f} s{broken}",
         f"episode {number}",
     )
+    if problem:
+        loop.terminal.line(f"no model is fitted to this episode: {problem}", f"episode {number}")
+
+
+def _data(loop: Loop, paths: Sequence[Path]) -> dict[str, Any]:
+    """Return the data YAML of episodes."""
+    own = {key: value for key, value in loop.config["data"].items() if key in MEASURED}
+    return own | {"path": [str(path) for path in paths], "time": "t", "split": {"test_fraction": 0}}
 
 
 def _fit_config(loop: Loop, number: int) -> dict[str, Any]:
     """Return the fit to all episodes so far; to none, the posterior is the prior."""
     config = {key: value for key, value in loop.config.items() if key not in OWN}
-    own = {key: value for key, value in config["data"].items() if key in MEASURED}
-    paths = [str(_file(loop, i)) for i in range(number)]
-    config["data"] = own | {"path": paths, "time": "t", "split": {"test_fraction": 0}}
-    return config
+    return config | {"data": _data(loop, _fitted(loop, number))}
+
+
+def _fitted(loop: Loop, number: int) -> list[Path]:
+    """Return the episodes before one that a fit can read."""
+    rounds = [json.loads((_folder(loop, i) / "round.json").read_text()) for i in range(number)]
+    return [_file(loop, i) for i, facts in enumerate(rounds) if facts.get("fitted", True)]
+
+
+def _recorded(loop: Loop, paths: Sequence[Path]) -> Recording:
+    return read(build(_data(loop, paths), "data", default=Measurements), loop.asked.source, loop.directory, 0)
+
+
+def _problem(loop: Loop, number: int, path: Path) -> str:
+    """Return why a fit can make nothing of an episode that follows those before; empty: it can."""
+    before = _fitted(loop, number)
+    try:
+        gained = len(_recorded(loop, [*before, path]).train) - len(_recorded(loop, before).train)
+    except DataError as error:
+        return str(error)
+    stack = loop.asked.encoding.stack
+    return "" if gained else f"it has fewer than {stack + 2} rows, of which one transition is made"
+
+
+def _accept(loop: Loop, number: int, ride: Ride) -> None:
+    """Refuse an episode of a rig that a fit could make nothing of.
+
+    Raises:
+        DataError: says why.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"episode_{number:03d}.parquet"
+        write_ride(path, ride, loop.asked.encoding, loop.asked.source.dt)
+        if problem := _problem(loop, number, path):
+            raise DataError(f"{path.name}: {problem}")
+
+
+def _refuse_wrong_data(loop: Loop) -> None:
+    """Look at the keys of the data YAML before anything is learned.
+
+    Raises:
+        ConfigError: one that does not fit the simulator.
+    """
+    measurements, source = build(_data(loop, []), "data", default=Measurements), loop.asked.source
+    states = tuple(q.name for q in source.states)
+    measurements.check_names((*states, *(q.name for q in source.inputs)), states)
 
 
 def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
@@ -229,19 +293,13 @@ def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
 def _surprise(loop: Loop, number: int, model: Learned) -> float:
     """Return the negative log-likelihood per transition of an episode under the model that had not seen it yet."""
     study = model.study
-    config = _fit_config(loop, number)["data"] | {"path": str(_file(loop, number))}
     try:
-        recording = read(build(config, "data", default=Measurements), study.system.source, loop.directory, 0)
+        recording = _recorded(loop, [_file(loop, number)])
         x, y = ev.test_arrays(transitions(recording.train, study.system.encoding.stack), study.system.encoding)
     except DataError:  # too short an episode to tell
         return float("nan")
     posterior = posteriors(study, model.fitted, model.state)[0]
     return float(np.mean(ev.one_step(posterior, x, y).nll[:, -1]))
-
-
-def _broken(folder: Path) -> float:
-    values = [r for r in read_metrics(folder / "metrics.parquet") if r["metric"] == "broken_in_model"]
-    return float(values[-1]["value"]) if values else 0.0
 
 
 def _facts(loop: Loop, number: int) -> dict[str, float]:
@@ -250,7 +308,8 @@ def _facts(loop: Loop, number: int) -> dict[str, float]:
     good, settled = table["good"][:-1], loop.asked.task.settled
     ended = bool(len(good) >= loop.asked.task.horizon and good[-settled:].all())
     facts: dict[str, float] = json.loads((_folder(loop, number) / "round.json").read_text())
-    return facts | {"return": float(table["reward"].sum()), "steps": float(len(good)), "success": float(ended)}
+    facts |= {"return": float(table["reward"].sum()), "steps": float(len(good))}
+    return facts | ({"success": float(ended)} if loop.asked.task.success else {})
 
 
 def _rows(loop: Loop) -> list[dict[str, Any]]:

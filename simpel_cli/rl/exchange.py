@@ -5,7 +5,7 @@
     DIR/episode_003.parquet                                            the rig's answer: a row per dt, columns by name
 
 An answer that cannot be used is renamed to `episode_003.refused-1.parquet`, what was wrong with it is written beside it, and
-the next one is waited for.
+another one is waited for, as long as for the first.
 """
 
 import json
@@ -24,6 +24,7 @@ from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
 from simpel_cli.rl.task import Goal
 
 POLL = 0.2  # s
+JITTER = 0.5  # of dt: how far a row's time may be from where it should be
 
 
 class Exchange:
@@ -34,9 +35,12 @@ class Exchange:
         encoding: names of states and inputs.
         goal: of the task.
         horizon: steps of an episode; rows beyond them are not looked at.
-        wait: s, until it gives up.
+        dt: s, between rows.
+        wait: s, for an answer, until it gives up.
         run: whose exchange this is: an answer that another run asked for is none.
+        accept: raises DataError of an episode, by its number, that a fit could not read.
         say: where a line for the user goes.
+        check: called while it waits; may raise.
     """
 
     def __init__(
@@ -45,12 +49,15 @@ class Exchange:
         encoding: Encoding,
         goal: Goal,
         horizon: int,
+        dt: float,
         wait: float,
         run: str,
+        accept: Callable[[int, Ride], None],
         say: Callable[[str], None],
+        check: Callable[[], None],
     ) -> None:
-        self.folder, self.encoding, self.goal, self.horizon = folder, encoding, goal, horizon
-        self.wait, self.run, self.say = wait, run, say
+        self.folder, self.encoding, self.goal, self.horizon, self.dt = folder, encoding, goal, horizon, dt
+        self.wait, self.run, self.accept, self.say, self.check = wait, run, accept, say, check
 
     def ride(self, number: int, policy: Path) -> Ride:
         """Hand out the policy and wait for the episode; see `Plant`.
@@ -66,6 +73,7 @@ class Exchange:
                 raise DataError(
                     f"{answer} is there, but this run did not ask for it. Use an empty folder, or move it away."
                 )
+            asked.unlink(missing_ok=True)  # a request of before does not stand beside half a policy
             shutil.copytree(policy, asked.parent, dirs_exist_ok=True)
             write_text(asked, json.dumps(request, indent=1))
         if not answer.exists():
@@ -74,9 +82,13 @@ class Exchange:
         while True:
             if answer.exists():
                 try:
-                    return self._read(answer)
+                    ride = self._read(answer)
+                    self.accept(number, ride)
+                    return ride
                 except DataError as error:
                     self._refuse(answer, str(error))
+                    end = time.monotonic() + self.wait
+            self.check()
             if time.monotonic() > end:
                 raise DataError(
                     f"{answer} did not come within {self.wait:g} s (online.wait). Everything is kept: put it there and "
@@ -93,15 +105,15 @@ class Exchange:
 
     def _read(self, path: Path) -> Ride:
         table = _table(path)
-        states, commands = (
-            np.stack([self._column(table, path, q.name) for q in group], axis=1)
-            for group in (self.encoding.states, self.encoding.inputs)
-        )
-        if len(states) < LEAST_ROWS:
-            raise DataError(f"{path.name}: {len(states)} rows; an episode has {LEAST_ROWS} at least.")
-        states, commands = states[: self.horizon + 1], commands[: self.horizon + 1]
+        rows = min(len(next(iter(table.values()), ())), self.horizon + 1)
+        if rows < LEAST_ROWS:
+            raise DataError(f"{path.name}: {rows} rows; an episode has {LEAST_ROWS} at least.")
+        self._in_time(table, path, rows)
+        states = np.stack([self._column(table, path, q.name, rows) for q in self.encoding.states], axis=1)
+        # of the last row nobody sees what its command led to, so that a rig need not know it
+        commands = np.stack([self._column(table, path, q.name, rows - 1) for q in self.encoding.inputs], axis=1)
         low, high = np.array(self.goal.low), np.array(self.goal.high)
-        beyond = (commands[:-1] < low - 1e-3 * (high - low)) | (commands[:-1] > high + 1e-3 * (high - low))
+        beyond = (commands < low - 1e-3 * (high - low)) | (commands > high + 1e-3 * (high - low))
         if beyond.any():
             row, column = np.argwhere(beyond)[0]
             q = self.encoding.inputs[column]
@@ -109,15 +121,32 @@ class Exchange:
                 f"{path.name}, row {row}: {q.name} is {commands[row, column]:g} {q.unit}; allowed are "
                 f"{low[column]:g} to {high[column]:g}."
             )
-        reward, good, over = earned(self.goal, states[1:], commands[:-1])
+        reward, good, over = earned(self.goal, self.encoding, states[1:], commands)
         last = int(np.argmax(over)) + 1 if over.any() else len(reward)
+        if last < self.horizon and not over.any():
+            self.say(f"{path.name} has {rows} rows of {self.horizon + 1}: taken as an episode that was cut short")
         return Ride(states[: last + 1], commands[:last], reward[:last], good[:last])
 
-    def _column(self, table: dict[str, np.ndarray], path: Path, name: str) -> np.ndarray:
+    def _in_time(self, table: dict[str, np.ndarray], path: Path, rows: int) -> None:
+        """Compare the column `t`, if there is one, with the rows' distance."""
+        if "t" not in table:
+            return
+        times = table["t"][:rows]
+        if np.issubdtype(times.dtype, np.datetime64):
+            times = (times - times[0]) / np.timedelta64(1, "s")
+        times = self._column({"t": times}, path, "t", rows)
+        late = np.flatnonzero(np.abs(times - times[0] - self.dt * np.arange(rows)) > JITTER * self.dt)
+        if len(late):
+            raise DataError(
+                f"{path.name}, row {late[0]}: t is {times[late[0]] - times[0]:g} s after the first row, where a row every "
+                f"{self.dt:g} s (sim.dt) has {self.dt * late[0]:g}. Send a row every {self.dt:g} s, or leave t out."
+            )
+
+    def _column(self, table: dict[str, np.ndarray], path: Path, name: str, rows: int) -> np.ndarray:
         if name not in table:
             raise DataError(f"{path.name}: the column {name} is missing; it has {', '.join(table)}.")
         try:
-            values = np.asarray(table[name], float)
+            values = np.asarray(table[name][:rows], float)
         except (TypeError, ValueError):
             raise DataError(f"{path.name}: the column {name} holds something other than numbers.") from None
         bad = np.flatnonzero(~np.isfinite(values))

@@ -45,7 +45,7 @@ def fine_tuned(
     """
     number = -(-BATCH // world.multiple) * world.multiple
     optimiser = optax.chain(
-        optax.zero_nans(), optax.clip_by_global_norm(CLIP), optax.adam(optax.cosine_decay_schedule(rate, steps))
+        optax.stateless(finite), optax.clip_by_global_norm(CLIP), optax.adam(optax.cosine_decay_schedule(rate, steps))
     )
 
     faded = fading(world, reach)
@@ -67,6 +67,11 @@ def fine_tuned(
     start = (policy.layers, begun, jnp.full((), jnp.inf, policy.mean.dtype), policy.layers)
     (_, _, _, best), returns = jax.lax.scan(step, start, jax.random.split(key, steps))
     return policy._replace(layers=best), returns
+
+
+def finite(slope: Any, params: Any = None) -> Any:
+    """Return a gradient without what is not finite: one such step would be the last that Adam takes."""
+    return jax.tree.map(lambda a: jnp.where(jnp.isfinite(a), a, jnp.zeros_like(a)), slope)
 
 
 def fading(world: World, reach: float) -> World:

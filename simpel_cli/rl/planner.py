@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.rl.rollout import Controller
+from simpel_cli.rl.rollout import Controller, charged
 from simpel_cli.rl.world import World
 
 
@@ -32,7 +32,7 @@ class ICEM:
 
     Args:
         ahead: steps that are planned.
-        population: sequences per round; rounded up where a posterior's particles share them.
+        population: sequences per round, each of which is tried in every particle of a posterior.
         elites: best sequences, which make the next mean and spread.
         rounds: per step.
         colour: exponent of the noise's power over frequency; 0 is white, 2 Brownian.
@@ -71,7 +71,7 @@ class ICEM:
             horizon: of the task; no plan is longer.
             dim_u: actions.
         """
-        ahead, number = min(self.ahead, horizon), -(-self.population // model.multiple) * model.multiple
+        ahead, number, particles = min(self.ahead, horizon), self.population, model.multiple
         again = int(self.keep * self.elites)
 
         def begin(episodes: int) -> Plan:
@@ -80,16 +80,19 @@ class ICEM:
 
         def worth(key: PRNGKeyArray, seen: Float[Array, " do"], actions: Float[Array, "P H du"]) -> Float[Array, " P"]:
             """Return what sequences of actions earn in the model."""
-            situation = model.at(jnp.broadcast_to(seen[None], (number, *seen.shape)))
+            # each in every particle: the best of sequences that had a particle each would be the luckiest
+            situation = model.at(jnp.broadcast_to(seen[None], (number * particles, *seen.shape)))
+            actions = jnp.tile(actions, (particles, 1, 1))
 
-            def one(carry: tuple[Any, Array], given: tuple[PRNGKeyArray, Array]) -> tuple[Any, Array]:
+            def one(carry: tuple[Any, Array], given: tuple[PRNGKeyArray, Array]) -> tuple[Any, Any]:
                 situation, alive = carry
                 after = model.step(given[0], situation, given[1])
-                return (after.situation, alive & ~after.judged.over), jnp.where(alive, after.judged.reward, 0.0)
+                reward = jnp.where(alive, after.judged.reward, 0.0)
+                return (after.situation, alive & ~after.judged.over), (reward, after.broken & alive)
 
             steps = (jax.random.split(key, ahead), jnp.moveaxis(actions, 1, 0))
-            earned = jax.lax.scan(one, (situation, jnp.ones(number, bool)), steps)[1]
-            return jnp.nan_to_num(jnp.sum(earned, axis=0), nan=-jnp.inf)
+            reward, broken = jax.lax.scan(one, (situation, jnp.ones(number * particles, bool)), steps)[1]
+            return jnp.mean(jnp.sum(charged(reward, broken), axis=0).reshape(particles, number), axis=0)
 
         def planned(key: PRNGKeyArray, seen: Float[Array, " do"], mean: Array, kept: Array) -> tuple[Plan, Array]:
             def turn(carry: tuple[Array, Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array, Array], None]:

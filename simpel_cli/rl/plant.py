@@ -68,16 +68,21 @@ class Rig(Protocol):
         ...
 
 
-def earned(goal: Goal, after: np.ndarray, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return reward, success and end of the steps of one episode.
+def earned(
+    goal: Goal, encoding: Encoding, after: np.ndarray, commands: np.ndarray, before: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return reward, success and end of successive steps.
 
     Args:
         goal: of the task.
+        encoding: of the states; angles are judged in [-pi, pi), however often the plant has turned.
         after: states after every step, (T, ds).
         commands: of every step, (T, du).
+        before: command of the step before the first, (du,); None: nobody had given one.
     """
-    before = np.concatenate([np.array([goal.rest]), commands[:-1]])
-    judged = goal.judge(jnp.asarray(after), jnp.asarray(commands), jnp.asarray(before))
+    earlier = np.concatenate([np.array([goal.rest if before is None else before]), commands[:-1]])
+    wrapped = encoding.decode(encoding.encode(after))
+    judged = goal.judge(jnp.asarray(wrapped), jnp.asarray(commands), jnp.asarray(earlier))
     return np.asarray(judged.reward), np.asarray(judged.good), np.asarray(judged.over)
 
 
@@ -111,10 +116,13 @@ class Simulated:
         self._run = jax.jit(one)
 
     def ride(self, number: int, policy: Path) -> Ride:
-        """Drive one episode; see `Plant`."""
+        """Drive one episode; see `Plant`. It ends where the simulator could not go on."""
         found = self._run(load_policy(policy)[0], jax.random.fold_in(self.key, number))
         found = jax.tree.map(lambda a: np.asarray(a)[:, 0] if a.ndim > 1 else np.asarray(a), found)
-        steps = max(min(int(found.lived.sum()), len(found.lived) - 1), 1)
+        # of the step that the simulator could not take no state is known
+        steps = min(int(found.lived.sum()) - int(found.broken.any()), len(found.lived) - 1)
+        if steps < 1:
+            raise DataError(f"episode {number}: no step was possible; the simulator gave no finite state at once.")
         states = np.asarray(self.encoding.decode(jnp.asarray(found.seen[:, : self.encoding.dim_state])))
         commands = np.asarray(self.goal.command(jnp.asarray(found.action)))
         return Ride(states[: steps + 1], commands[:steps], found.reward[:steps], found.good[:steps])
@@ -148,11 +156,12 @@ class Stepped:
             commands.append(command)
             measured.append(np.asarray(seen, float))
             true.append(np.asarray(state, float))
-            if ended or earned(self.goal, np.array(true[-1:]), np.array(commands[-1:]))[2][0]:
+            before = commands[-2] if len(commands) > 1 else None
+            if ended or earned(self.goal, self.encoding, np.array(true[-1:]), np.array(commands[-1:]), before)[2][0]:
                 break
         if not commands:
             raise DataError(f"episode {number}: no step was possible; a state was not finite at once: {measured[0]}.")
-        reward, good, _ = earned(self.goal, np.array(true), np.array(commands))
+        reward, good, _ = earned(self.goal, self.encoding, np.array(true), np.array(commands))
         return Ride(np.array(measured), np.array(commands), reward, good)
 
 

@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
+from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.task import Goal
 from simulators.worlds.world import World
 
@@ -20,29 +21,23 @@ class WorldRig:
         world: to step; its parameters take the middle of their ranges.
         encoding: of the simulator, whose states the world has by name, perhaps among others.
         goal: of the task.
+        dt: s, of the simulator.
         noise_std: of the sensors, per state of the simulator.
         key: of the initial states and of the noise.
 
     Raises:
-        ConfigError: a state or an input that the world does not have.
+        ConfigError: what the world has, it has in another way than the simulator.
     """
 
-    def __init__(self, world: World, encoding: Encoding, goal: Goal, noise_std: np.ndarray, key: PRNGKeyArray) -> None:
+    def __init__(
+        self, world: World, encoding: Encoding, goal: Goal, dt: float, noise_std: np.ndarray, key: PRNGKeyArray
+    ) -> None:
+        check_comparable("mujoco", world, encoding, goal, dt, by_name=True)
         self.world, self.goal, self.noise_std, self.key = world, goal, noise_std, key
-        self.columns = self._columns("states", encoding)
-        self._columns("inputs", encoding)
+        self.columns = [[q.name for q in world.states].index(q.name) for q in encoding.states]
         self.order = [[q.name for q in encoding.inputs].index(q.name) for q in world.inputs]
         self.phi = np.array([[q.middle for q in world.params]])
         self.state, self.rng = np.zeros(len(world.states)), np.random.default_rng()
-
-    def _columns(self, what: str, encoding: Encoding) -> list[int]:
-        have, need = ([q.name for q in getattr(e, what)] for e in (self.world, encoding))
-        missing = [name for name in need if name not in have]
-        if missing or (what == "inputs" and len(have) > len(need)):
-            raise ConfigError(
-                f"mujoco: {what} of {self.world.name} are {', '.join(have)}; those of sim are {', '.join(need)}."
-            )
-        return [have.index(name) for name in need]
 
     def reset(self, number: int) -> np.ndarray:
         """Begin an episode; see `Rig`."""

@@ -17,7 +17,7 @@ class Episodes(NamedTuple):
         encoded: states, the initial one first.
         seen: observations that the policy acted on.
         action: in [-1, 1], clipped.
-        reward: of every step; 0 after the end.
+        reward: of every step; 0 after the end, and after the world could not go on what `charged` says.
         good: whether the state was where it should be.
         lived: steps that count.
         broken: whether the world could not go on.
@@ -64,7 +64,7 @@ def episodes(world: World, controller: Controller, key: PRNGKeyArray, number: in
     first = world.reset(key_reset, number)
 
     def one(carry: Any, key: PRNGKeyArray) -> Any:
-        situation, alive, broken, memory = carry
+        situation, alive, memory = carry
         key_see, key_step, key_act = jax.random.split(key, 3)
         seen = world.observe(key_see, situation)
         memory, chosen = controller.act(key_act, memory, seen)
@@ -74,11 +74,20 @@ def episodes(world: World, controller: Controller, key: PRNGKeyArray, number: in
         kept = jax.tree.map(
             lambda a, b: jnp.where(alive.reshape(number, *[1] * (a.ndim - 1)), a, b), after.situation, situation
         )
-        row = (kept.encoded, seen, action, reward, after.judged.good & alive, alive)
-        return (kept, alive & ~after.judged.over, broken | (after.broken & alive), memory), row
+        row = (kept.encoded, seen, action, reward, after.judged.good & alive, alive, after.broken & alive)
+        return (kept, alive & ~after.judged.over, memory), row
 
-    start = (first, jnp.ones(number, bool), jnp.zeros(number, bool), controller.begin(number))
-    (_, _, broken, _), (encoded, *rest) = jax.lax.scan(one, start, jax.random.split(key_steps, horizon))
-    seen, action, reward, good, lived = rest
+    start = (first, jnp.ones(number, bool), controller.begin(number))
+    _, (encoded, *rest) = jax.lax.scan(one, start, jax.random.split(key_steps, horizon))
+    seen, action, reward, good, lived, broken = rest
     states = jnp.concatenate([first.encoded[None], encoded])
-    return Episodes(states, seen, action, reward, good, lived, broken)
+    return Episodes(states, seen, action, charged(reward, broken), good, lived, jnp.any(broken, axis=0))
+
+
+def charged(reward: Float[Array, "T B"], broken: Bool[Array, "T B"]) -> Float[Array, "T B"]:
+    """Return rewards of which those from a step on that the world could not take are the least of all, or 0 if that is less.
+
+    Where rewards are negative, nothing would pay as well as driving a model to where it has no answer.
+    """
+    least = jax.lax.stop_gradient(jnp.minimum(jnp.min(reward), 0.0))
+    return jnp.where(jnp.cumsum(broken, axis=0) > 0, least, reward)

@@ -7,6 +7,7 @@ Reference: Haarnoja et al. (2018), Soft actor-critic algorithms and applications
 al. (2018).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -148,6 +149,10 @@ class SAC:
         for name in ("discount", "polyak"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"policy.{name}: got {getattr(self, name)}; it must be above 0 and at most 1.")
+        if not 0 <= self.final_learning_rate <= 1:
+            raise ConfigError(f"policy.final_learning_rate: got {self.final_learning_rate}; allowed are 0 to 1.")
+        if not math.isfinite(self.target_entropy):
+            raise ConfigError(f"policy.target_entropy: got {self.target_entropy}; it must be a finite number.")
         if self.clip is not None and not self.clip > 0:
             raise ConfigError(f"policy.clip: got {self.clip}; it must be positive, or null.")
         if self.episode is not None and self.episode < 1:
@@ -182,7 +187,7 @@ class SAC:
         network = MLP(self.hidden, negative_slope=0.0)
         actor = Actor(network, dim_u)
         n, length = self.side_by_side(world.multiple), self.episode or horizon
-        new = n * self.collect
+        new, lasting = n * self.collect, 1 / (1 - self.discount) if self.discount < 1 else length
         rounds = max(1, round(self.updates * new))
         capacity = max(1, self.capacity // new) * new
         total = self.iterations(world.multiple) * rounds
@@ -240,13 +245,16 @@ class SAC:
                 )
                 begun = world.observe(key_begin, fresh).astype(dtype)
                 carry = (following, jnp.where(anew, 0, age + 1), jnp.where(anew[:, None], begun, then))
-                return carry, (row, jnp.mean(after.broken.astype(dtype)))
+                return carry, (row, after.broken)
 
             carry, (rows, broken) = jax.lax.scan(
                 one, (state.situation, state.age, state.seen), jax.random.split(key, self.collect)
             )
+            # a step that the world could not take costs what the least reward costs for ever (see `charged`)
+            least = jnp.minimum(jnp.min(rows.reward), 0.0) * lasting
+            rows = rows._replace(reward=jnp.where(broken, least, rows.reward))
             rows = jax.tree.map(lambda a: a.reshape(new, *a.shape[2:]), rows)
-            return carry, rows, jnp.mean(broken)
+            return carry, rows, jnp.mean(broken.astype(dtype))
 
         def loss(
             weights: Weights, targets: Float[Array, " c"], batch: Transitions, noise: Float[Array, "2 b du"]

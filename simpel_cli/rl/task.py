@@ -93,7 +93,10 @@ class Task:
         for name in ("horizon", "settled"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"reward.{name}: got {getattr(self, name)}; it must be at least 1.")
-        if self.settled > self.horizon:
+        for name, std in self.noise_std.items():
+            if not 0 <= std < math.inf:
+                raise ConfigError(f"reward.noise_std.{name}: got {std}; it must be 0 or more, and finite.")
+        if self.success and self.settled > self.horizon:
             raise ConfigError(f"reward.settled: got {self.settled}; it is at most reward.horizon ({self.horizon}).")
 
     def bind(self, encoding: Encoding) -> Goal:
@@ -147,7 +150,7 @@ class Task:
     def _limits(self, quantity: Quantity) -> tuple[float, float]:
         ends = self.limits.get(quantity.name, (quantity.low, quantity.high))
         path = f"reward.limits.{quantity.name}"
-        if not (isinstance(ends, list | tuple) and len(ends) == 2 and all(isinstance(e, int | float) for e in ends)):
+        if not (isinstance(ends, list | tuple) and len(ends) == 2 and all(map(_finite, ends))):
             raise ConfigError(f"{path}: got {ends!r}; write [low, high].")
         if not quantity.low <= ends[0] < ends[1] <= quantity.high:
             raise ConfigError(
@@ -173,12 +176,17 @@ def _known(path: str, given: Mapping[str, Any], quantities: tuple[Quantity, ...]
 
 def _law(path: str, node: Any) -> Callable[[PRNGKeyArray, int], Float[Array, " n"]]:
     """Return the law of an initial value."""
-    if isinstance(node, int | float) and not isinstance(node, bool):
+    if _finite(node):
         return lambda key, n: jnp.full((n,), float(node), jnp.float32)
-    if isinstance(node, list | tuple) and len(node) == 2 and node[0] <= node[1]:
+    if isinstance(node, list | tuple) and len(node) == 2 and all(map(_finite, node)) and node[0] <= node[1]:
         low, high = float(node[0]), float(node[1])
         return lambda key, n: jax.random.uniform(key, (n,), jnp.float32, low, high)
-    if isinstance(node, Mapping) and set(node) == {"mean", "std"} and node["std"] >= 0:
+    both = isinstance(node, Mapping) and set(node) == {"mean", "std"} and all(map(_finite, node.values()))
+    if both and node["std"] >= 0:
         mean, std = float(node["mean"]), float(node["std"])
         return lambda key, n: mean + std * jax.random.normal(key, (n,), jnp.float32)
     raise ConfigError(f"{path}: got {node!r}; write a number, [low, high] or {{mean: ..., std: ...}}.")
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
