@@ -115,10 +115,10 @@ def test_the_true_world_is_the_simulator_with_its_delay() -> None:
     situation = world.reset(jax.random.key(1), 2)
     state = np.asarray(encoding.decode(situation.encoded), float)
     plant = RK4(model)
-    given = np.zeros((2, 3, 2))
+    given, step = np.zeros((2, 3, 2)), jax.jit(world.step)
     for action in actions:
         given = np.concatenate([given, action[:, None]], axis=1)
-        situation = world.step(jax.random.key(2), situation, jnp.asarray(action, jnp.float32)).situation
+        situation = step(jax.random.key(2), situation, jnp.asarray(action, jnp.float32)).situation
         state = plant.follow(state, given[:, -4:], np.zeros((2, 0)))
     np.testing.assert_allclose(encoding.decode(situation.encoded), state, atol=2e-5)
     np.testing.assert_allclose(situation.past, actions[-3:].swapaxes(0, 1), atol=1e-6)
@@ -592,4 +592,4 @@ def test_a_planner_in_place_of_a_policy(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "policy").exists()
     assert (tmp_path / "run" / "episodes.parquet").exists()
     wrong = simpel(tmp_path, *SMALL, "planner=icem", "planner.elites=500", "hydra.run.dir=wrong")
-    assert "planner.elites: got 500; it is at most planner.population (120)" in wrong.err
+    assert "planner.elites: got 500; it is at most planner.population (32)" in wrong.err

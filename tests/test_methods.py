@@ -350,8 +350,8 @@ def test_svgd_moves_weights_along_steins_velocity_of_the_log_posterior() -> None
     method = SVGD(steps=1, particles=4, network=MLP((3,)), batch=N, bandwidth=1.5, noise=FIXED)
     problem = problem_of(y)
     rule = method.bind(setting_of(prior_of()), problem)
-    state = rule.init(jax.random.key(0))
-    after, info = rule.step(jax.random.key(1), state, None)
+    state = jax.jit(rule.init)(jax.random.key(0))
+    after, info = jax.jit(rule.step)(jax.random.key(1), state, None)
     flat, unflatten = jax.flatten_util.ravel_pytree(jax.tree.map(lambda a: a[0], state.particles))
 
     def log_posterior(w: jax.Array) -> jax.Array:

@@ -42,8 +42,8 @@ class ICEM:
     """
 
     ahead: int = 30
-    population: int = 120
-    elites: int = 12
+    population: int = 32
+    elites: int = 6
     rounds: int = 3
     colour: float = 2.0
     std: float = 0.5

@@ -54,7 +54,7 @@ def jobs(what: str, methods: Sequence[str], size: str, seeds: int, episodes: int
         for n in SIZES[size] if what == "offline" else (0,):
             for seed in range(seeds):
                 words = words_of(name, seed)
-                words += [f"data.n_train={n}"] if n else ["reward.horizon=100", f"online.episodes={episodes}"]
+                words += [f"data.n_train={n}", "run.figures=false"] if n else ["reward.horizon=100", f"online.episodes={episodes}"]
                 every.append(Fit("parking", name, n, seed, tuple(words), f"rl-{what}"))
     return every
 
