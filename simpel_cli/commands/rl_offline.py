@@ -118,7 +118,9 @@ def _of_run(tree: Any, i: int) -> Any:
 
 def _task_line(asked: Assignment) -> str:
     where = (
-        f"judged in {asked.truth_name}" if asked.truth is not None else "no true world to judge in (truth: a simulator)"
+        f"judged in the simulator {asked.truth_name}"
+        if asked.truth is not None
+        else "no true world to judge in (truth: a simulator)"
     )
     return f"{asked.task.horizon} steps   {_learner(asked)}, sampling {asked.control.sampling}   {where}"
 
@@ -217,7 +219,7 @@ def _publish(
         f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
     ]
     note = (
-        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in {asked.truth_name}; intervals over episodes."
+        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; intervals over episodes."
         if judged is not None
         else "There is no true world to judge in: name one with sim@truth=, or try the policy on the rig."
     )
