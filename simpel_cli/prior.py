@@ -126,7 +126,7 @@ class SimulatorPrior:
     """
 
     gap: GapGP | None = GapGP()
-    draws: int = 1028
+    draws: int = 256
     white_variance: float = 1e-4
 
     uses_simulator = True  # not a field: the targets' normaliser and `fit` ask for it

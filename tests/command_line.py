@@ -16,7 +16,8 @@ ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".pytest_cache" / "cache"  # compiled programs are shared by all tests and their processes
 PATIENCE = 1800.0  # s for a process that hangs; a loaded machine is no failure
 TINY = (
-    "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64",
+    "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "method.sets=16",
+    "prior.draws=64",
     "run.figures=false", "run.quiet=true",
 )  # fmt: skip
 FIT = ("fit", "experiment=pendulum", *TINY)

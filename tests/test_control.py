@@ -390,7 +390,8 @@ def test_a_damaged_policy_is_refused(tmp_path: Path) -> None:
 
 SMALL = (
     "rl-offline", "experiment=pendulum_swing_up", "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]",
-    "method.pool=64", "prior.draws=64", "policy.steps=4000", "policy.environments=8", "policy.policies=2", "policy.looks=4",
+    "method.pool=64", "method.sets=16", "prior.draws=64",
+    "policy.steps=4000", "policy.environments=8", "policy.policies=2", "policy.looks=4",
     "policy.hidden=[16]", "control.episodes=4", "control.fine_tune=3", "run.seeds=2",
 )  # fmt: skip
 

@@ -11,7 +11,14 @@ from command_line import process
 
 TRUTH = Path(__file__).parent / "exam" / "truth"
 FEW = "effect=[viscous_friction,coulomb_friction,input_delay]"
-QUICK = ("method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "prior.draws=64")
+QUICK = (
+    "method.steps=100",
+    "method.particles=4",
+    "method.network.hidden=[16,16]",
+    "method.pool=64",
+    "method.sets=16",
+    "prior.draws=64",
+)
 
 
 @pytest.fixture(scope="module")

@@ -317,7 +317,8 @@ def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path:
 
 SMALL = (
     "rl-online", "experiment=pendulum_swing_up", "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]",
-    "method.pool=64", "prior.draws=64", "policy.steps=4000", "policy.environments=8", "policy.looks=3", "policy.hidden=[16]",
+    "method.pool=64", "method.sets=16", "prior.draws=64",
+    "policy.steps=4000", "policy.environments=8", "policy.looks=3", "policy.hidden=[16]",
     "control.episodes=4", "control.fine_tune=0", "reward.horizon=12", "reward.settled=5", "online.episodes=3",
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ from command_line import PATIENCE, process, simpel, start
 
 FIT = (
     "fit", "experiment=pendulum", "method.steps=6000", "method.particles=6", "method.network.hidden=[32,32]",
-    "method.pool=64", "prior.draws=64", "run.figures=false",
+    "method.pool=64", "method.sets=16", "prior.draws=64", "run.figures=false",
 )  # fmt: skip
 
 

@@ -219,7 +219,8 @@ def _publish(
         f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
     ]
     note = (
-        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; intervals over episodes."
+        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; intervals over "
+        "episodes."
         if judged is not None
         else "There is no true world to judge in: name one with sim@truth=, or try the policy on the rig."
     )

@@ -83,8 +83,8 @@ class FunctionSpace(ABC):
     weight_decay: float = 1e-3
     batch: int = 24
     fresh_points: int = 16
-    pool: int = 256
-    sets: int = 64
+    pool: int = 1024
+    sets: int = 128
     prior_weight: float = 1.0
     precondition: bool = False
     noise: NoiseModel = NoiseModel()

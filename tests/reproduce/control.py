@@ -30,8 +30,6 @@ METHODS = {  # name -> (method of simpel, simulator)
     "sysid": ("sysid", LOW),
     "pathwise": ("pathwise", LOW),
 }
-DRAWS = {"simpel": 256, "simpel_high_fidelity": 256, "pathwise": 512}
-POINTS = ("method.pool=1024", "method.sets=128")  # as in the panels of the regressions
 SIZES = {"small": (50, 200, 1000), "full": (20, 50, 200, 1000)}
 SEEDS = {"small": 2, "full": 5}
 ONLINE = ("simpel", "fsvgd", "pathwise", "sysid")
@@ -42,9 +40,7 @@ LAST = 3  # episodes that are the end
 def words_of(name: str, seed: int) -> list[str]:
     """Return the words of a method."""
     method, sim = METHODS[name]
-    words = ["experiment=rc_car_parking", f"sim={sim}", f"method={method}", f"run.seed={seed}", f"run.name={name}"]
-    words += POINTS if method in ("simpel", "simpel_high_fidelity", "fsvgd") else []
-    return words + ([f"prior.draws={DRAWS[name]}"] if name in DRAWS else [])
+    return ["experiment=rc_car_parking", f"sim={sim}", f"method={method}", f"run.seed={seed}", f"run.name={name}"]
 
 
 def jobs(what: str, methods: Sequence[str], size: str, seeds: int, episodes: int) -> list[Fit]:
@@ -54,7 +50,8 @@ def jobs(what: str, methods: Sequence[str], size: str, seeds: int, episodes: int
         for n in SIZES[size] if what == "offline" else (0,):
             for seed in range(seeds):
                 words = words_of(name, seed)
-                words += [f"data.n_train={n}", "run.figures=false"] if n else ["reward.horizon=100", f"online.episodes={episodes}"]
+                own = (f"data.n_train={n}", "run.figures=false")
+                words += own if n else ("reward.horizon=100", f"online.episodes={episodes}")
                 every.append(Fit("parking", name, n, seed, tuple(words), f"rl-{what}"))
     return every
 
