@@ -2,6 +2,8 @@
 
     python -m tests.reproduce.control offline --size small --out runs/reproduce/offline
     python -m tests.reproduce.control online --size small --out runs/reproduce/online
+    simpel discover experiment=rc_car_parking 'effect=[vehicle]' close=false hydra.run.dir=DIR
+    python -m tests.reproduce.control online --corrected DIR --methods simpel simpel_corrected
 
 Offline: return in the true car (100 episodes of 200 steps) of a policy that was learned in a posterior of n transitions of
 recorded drives without noise. Online: return of every episode of 100 steps, the first of which knows the prior alone. A
@@ -18,7 +20,7 @@ import scipy.stats
 
 from simpel_cli.plots.canvas import columns_of, legend_below, line_style, new_figure, save
 from simpel_cli.records import write_table, write_text
-from tests.reproduce.panel import Fit, run, tested, verdict
+from tests.reproduce.panel import CONF, Fit, run, tested, verdict
 from tests.reproduce.static import folder
 
 LOW, HIGH = "parking_bicycle", "parking_high_fidelity"
@@ -30,6 +32,7 @@ METHODS = {  # name -> (method of simpel, simulator)
     "sysid": ("sysid", LOW),
     "pathwise": ("pathwise", LOW),
 }
+CORRECTED = "simpel_corrected"  # with the simulator that a run of `discover` left
 SIZES = {"small": (50, 200, 1000), "full": (20, 50, 200, 1000)}
 SEEDS = {"small": 2, "full": 5}
 ONLINE = ("simpel", "fsvgd", "pathwise", "sysid")
@@ -43,16 +46,25 @@ def words_of(name: str, seed: int) -> list[str]:
     return ["experiment=rc_car_parking", f"sim={sim}", f"method={method}", f"run.seed={seed}", f"run.name={name}"]
 
 
-def jobs(what: str, methods: Sequence[str], size: str, seeds: int, episodes: int) -> list[Fit]:
+def corrected(run: Path) -> Path:
+    """Return the YAML of the simulator that a run of `discover` corrected."""
+    found = sorted((run / "conf" / "sim").glob("*.yaml"))
+    if len(found) != 1:
+        raise SystemExit(
+            f"--corrected {run}: holds {len(found)} corrected simulators; needed is the run of a verdict `effect`."
+        )
+    return found[0]
+
+
+def jobs(what: str, methods: Sequence[str], size: str, seeds: int, episodes: int, conf: Path = CONF) -> list[Fit]:
     """Return every run of an experiment."""
     every = []
     for name in methods:
         for n in SIZES[size] if what == "offline" else (0,):
             for seed in range(seeds):
                 words = words_of(name, seed)
-                own = (f"data.n_train={n}", "run.figures=false")
-                words += own if n else ("reward.horizon=100", f"online.episodes={episodes}")
-                every.append(Fit("parking", name, n, seed, tuple(words), f"rl-{what}"))
+                words += [f"data.n_train={n}"] if n else ["reward.horizon=100", f"online.episodes={episodes}"]
+                every.append(Fit("parking", name, n, seed, tuple(words), f"rl-{what}", conf))
     return every
 
 
@@ -202,15 +214,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="tests.reproduce.control", description=__doc__)
     parser.add_argument("what", choices=("offline", "online"))
     parser.add_argument("--size", choices=tuple(SIZES), default="small")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS))
+    parser.add_argument("--corrected", type=Path, help="run of discover, for simpel_corrected")
+    parser.add_argument("--methods", nargs="+", choices=[*METHODS, CORRECTED])
     parser.add_argument("--seeds", type=int, help="small: 2, full: 5")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     out = folder(asked.out, asked.what)
+    conf = CONF
+    if asked.corrected is not None:
+        sim = corrected(asked.corrected)
+        METHODS[CORRECTED], conf = ("simpel", sim.stem), sim.parents[1].absolute()
     methods = asked.methods or (list(METHODS) if asked.what == "offline" else list(ONLINE))
-    every = jobs(asked.what, methods, asked.size, asked.seeds or SEEDS[asked.size], asked.episodes)
+    if CORRECTED in methods and CORRECTED not in METHODS:
+        parser.error("simpel_corrected needs --corrected DIR")
+    every = jobs(asked.what, methods, asked.size, asked.seeds or SEEDS[asked.size], asked.episodes, conf)
     run(every, out, asked.processes)
     lines = (offline if asked.what == "offline" else online)(every, out)
     write_text(out / f"{asked.what}.md", "\n".join(lines) + "\n")

@@ -38,6 +38,7 @@ class Fit(NamedTuple):
         data_seed: of measurements, or of what of them is trained on.
         words: overrides of the verb.
         verb: of simpel.
+        conf: folder of groups that simpel does not bring.
     """
 
     system: str
@@ -46,6 +47,7 @@ class Fit(NamedTuple):
     data_seed: int
     words: tuple[str, ...]
     verb: str = "fit"
+    conf: Path = CONF
 
     @property
     def name(self) -> str:
@@ -180,7 +182,7 @@ def _fit(fit: Fit, directory: Path) -> str:
             directory.rename(old)
     words = [*fit.words, f"hydra.run.dir={directory}", "run.figures=false", "run.quiet=true"]
     try:
-        launch(fit.verb, task, words, config_dir=CONF, flags=[])
+        launch(fit.verb, task, words, config_dir=fit.conf, flags=[])
     except Exception as error:  # whatever it is, it costs this fit and no other
         return f"failed: {error!r}"
     write_text(directory / WORDS, "\n".join(fit.words) + "\n")
