@@ -199,6 +199,7 @@ def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None
         assert not nothing.any()
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_optimum_of_the_exact_likelihood(plan: Setup) -> None:
     from scipy.optimize import minimize
 

@@ -116,6 +116,7 @@ def assert_same_posterior(one: Fitted, other: Fitted, rtol: float) -> None:
     np.testing.assert_allclose(one.mean[0, INSIDE], other.mean[0, INSIDE], atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [8, 32])
 def test_posterior_does_not_depend_on_the_number_of_measurement_points(reference: Fitted, points: int) -> None:
     assert_same_posterior(fitted(dataclasses.replace(SMALL, fresh_points=points)), reference, 0.06)

@@ -247,6 +247,7 @@ def test_the_least_noise_of_greybox_is_what_its_own_prior_leaves_of_the_residual
     np.testing.assert_allclose(state.scale, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wave", [0.0, 0.02])
 def test_the_scale_of_what_greybox_learns_is_what_the_simulator_leaves(wave: float) -> None:
     x = np.random.default_rng(3).uniform(-EDGE, EDGE, (100, 1))

@@ -233,15 +233,15 @@ def exchange_of(
     return Exchange(folder, encoding, goal, HORIZON, 0.05, wait, run, accept, said.append, lambda: None)
 
 
-def answer_of(folder: Path, rows: int) -> dict[str, Any]:
+def answer_of(folder: Path, rows: int, angle: str = "phi", speed: str = "omega") -> dict[str, Any]:
     """What a rig measures, driven by the runner beside its policy."""
     runner = PolicyRunner(folder)
-    state, columns = {"phi": 3.0, "omega": 0.0}, {"phi": [], "omega": [], "u": []}
+    state, columns = {angle: 3.0, speed: 0.0}, {angle: [], speed: [], "u": []}
     for _ in range(rows):
         command = runner.command(state)
         for name, value in (state | command).items():
             columns[name].append(value)
-        state = {"phi": state["phi"] + 0.05 * state["omega"], "omega": state["omega"] + 0.05 * command["u"]}
+        state = {angle: state[angle] + 0.05 * state[speed], speed: state[speed] + 0.05 * command["u"]}
     return {name: np.array(values) for name, values in columns.items()}
 
 
@@ -417,46 +417,36 @@ def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> No
     assert "Traceback" not in result.err
 
 
-CART = {
-    "_target_": "simulators.model.Declared", "name": "cart", "dt": 0.05,
-    "states": {"s": {"unit": "m", "range": [-0.5, 0.5]}, "v": {"unit": "m/s", "range": [-2, 2]}},
-    "inputs": {"u": {"unit": "V", "range": [-3, 3]}},
-    "parameters": {"m": {"unit": "kg", "range": [0.5, 2.0]}, "k": {"unit": "N/m", "range": [5, 50]}, "c": 2.0},
-    "dynamics": {"s": "v", "v": "(c*u - k*s)/m"},
-}  # fmt: skip
-LIFT = {
-    "_target_": "simpel_cli.rl.task.Task", "reward": "1 - (s - 0.2)**2", "initial": {"s": [-0.1, 0.1]}, "horizon": 12,
-    "settled": 5,
-}  # fmt: skip
-
-
 def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
     """As docs/control.md has it: no data, a simulator and a task; then what became of the run is not overwritten."""
-    for group, name, node in (("sim", "cart", CART), ("reward", "lift", LIFT)):
+    text = (ROOT / "conf" / "sim" / "pendulum.yaml").read_text().replace("phi", "angle").replace("omega", "speed")
+    node = yaml.safe_load(text)
+    lift = {
+        "_target_": "simpel_cli.rl.task.Task",
+        "reward": "cos(angle)",
+        "initial": {"angle": [3, 3.2]},
+        "horizon": 12,
+    }
+    for group, name, content in (("sim", "mine", node), ("reward", "lift", lift)):
         (tmp_path / "my" / group).mkdir(parents=True)
-        (tmp_path / "my" / group / f"{name}.yaml").write_text(yaml.safe_dump(node))
+        (tmp_path / "my" / group / f"{name}.yaml").write_text(yaml.safe_dump(content))
     small = [word for word in SMALL[2:] if not word.startswith(("reward.", "online."))]
-    words = ("rl-online", "--config-dir", "my", "sim=cart", "reward=lift", "world=folder:exchange", *small)
+    words = ("rl-online", "--config-dir", "my", "sim=mine", "reward=lift", "world=folder:exchange", *small)
     asked, answer = tmp_path / "exchange" / "episode_000", tmp_path / "exchange" / "episode_000.parquet"
 
     def rig() -> None:
         while not (asked / "request.json").exists():
             time.sleep(0.02)
-        runner, rows, s, v = PolicyRunner(asked), [], 0.05, 0.0
-        for _ in range(13):
-            rows.append((s, v, runner.command({"s": s, "v": v})["u"]))
-            s, v = s + 0.05 * v, v + 0.05 * (2 * rows[-1][2] - 20 * s)
-        columns = dict(zip(("s", "v", "u"), np.array(rows).T, strict=True))
-        write_table(answer, {name: np.zeros(13) for name in columns})  # it was switched off
+        good = answer_of(asked, 13, "angle", "speed")
+        write_table(answer, {name: np.zeros(13) for name in good})  # it was switched off
         while answer.exists():
             time.sleep(0.02)
-        write_table(tmp_path / "exchange" / "new.parquet", columns)
+        write_table(tmp_path / "exchange" / "new.parquet", good)
         (tmp_path / "exchange" / "new.parquet").rename(answer)
 
     thread = threading.Thread(target=rig, daemon=True)
     thread.start()
     result = simpel(tmp_path, *words, "online.episodes=2", "online.wait=1.5", "hydra.run.dir=run")
-    thread.join()
     assert "refused: episode_000.parquet: nothing moves" in result.out
     assert "episode_001.parquet did not come within 1.5 s" in result.err  # the first was taken, the second asked for
     assert pq.read_table(tmp_path / "run" / "episodes" / "000.parquet").num_rows == 13

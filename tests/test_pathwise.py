@@ -150,6 +150,7 @@ def test_paths_of_another_seed_are_others() -> None:
     assert np.abs(np.asarray(one.h[:, 32:] - other.h[:, 32:])).mean() > 0.005
 
 
+@pytest.mark.slow
 def test_networks_learn_the_paths() -> None:
     method = Pathwise(steps=2000, particles=16, network=MLP((32, 32)), pool=128, features=500, noise=FIXED)
     y = noisy()
