@@ -22,7 +22,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { padding: .25rem .9rem .25rem 0; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap }
 th:first-child, td:first-child { text-align: left } td.text { white-space: normal; text-align: left }
 code, pre { background: #f4f4f2; padding: .1rem .3rem; border-radius: 3px; font-size: .85rem }
-pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere }
+pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } summary { cursor: pointer }
 .warn { color: #a33 } .interval { color: #777; font-size: .85em }
 @media print { body { margin: 0; max-width: none } h2 { break-after: avoid } img, table { break-inside: avoid } }
 </style></head><body>
@@ -45,7 +45,7 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere }
  src="data:image/png;base64,{{ section.image }}">{% endif %}
 {% if section.after %}<p>{{ section.after }}</p>{% endif %}{% endfor %}
 <h2>Go on</h2><pre>{{ commands }}</pre>
-<h2>Configuration</h2><pre>{{ config }}</pre>
+<h2>Configuration</h2><details><summary>Every key, as resolved</summary><pre>{{ config }}</pre></details>
 </body></html>
 """
 
