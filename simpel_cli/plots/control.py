@@ -34,7 +34,7 @@ def draw_control(directory: Path, horizon: int) -> list[Path]:
         table, units = columns_of(path), units_of(path)
         made.append(save(_paths(table, units), directory / "trajectories.png"))
         if {"x", "y", "theta"} <= set(table):
-            _film(_median(table), directory / "manoeuvre.gif")
+            _film(_median(table), units, directory / "manoeuvre.gif")
     return made
 
 
@@ -45,7 +45,9 @@ def draw_online(directory: Path) -> list[Path]:
     tables = [columns_of(path) for path in files]
     made.append(save(_courses(tables, units_of(files[0])), directory / "trajectories.png"))
     if {"x", "y", "theta"} <= set(tables[-1]):
-        _film({name: tables[-1][name] for name in ("x", "y", "theta")}, directory / "manoeuvre.gif")
+        _film(
+            {name: tables[-1][name] for name in ("x", "y", "theta")}, units_of(files[-1]), directory / "manoeuvre.gif"
+        )
     return made
 
 
@@ -145,8 +147,8 @@ def _median(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: table[name][own][order] for name in ("x", "y", "theta")}
 
 
-def _film(table: dict[str, np.ndarray], path: Path) -> None:
-    """Draw the course of x, y and theta as a car on the plane."""
+def _film(table: dict[str, np.ndarray], units: dict[str, str], path: Path) -> None:
+    """Draw the course of x, y and theta as a car on the plane, with the steps counted above it."""
     from PIL import Image
 
     x, y, theta = (table[name] for name in ("x", "y", "theta"))
@@ -155,7 +157,7 @@ def _film(table: dict[str, np.ndarray], path: Path) -> None:
     margin = 0.5
     axis.set(
         xlim=(min(x.min(), 0) - margin, max(x.max(), 0) + margin), ylim=(min(y.min(), 0) - margin, max(y.max(), 0) + margin),
-        aspect="equal", xlabel="x", ylabel="y",
+        aspect="equal", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]), title="step 0",
     )  # fmt: skip
     axis.plot(0, 0, "+", color=BLACK, markersize=12)
     (trail,) = axis.plot([], [], color=COLOURS[0], linewidth=1)
@@ -167,6 +169,7 @@ def _film(table: dict[str, np.ndarray], path: Path) -> None:
         turn = np.array([[np.cos(theta[k]), np.sin(theta[k])], [-np.sin(theta[k]), np.cos(theta[k])]])
         trail.set_data(x[: k + 1], y[: k + 1])
         car.set_data(*(outline @ turn + [x[k], y[k]]).T)
+        axis.set_title(f"step {k}")
         figure.canvas.draw()
         frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
     with replacing(path) as temporary:
