@@ -42,7 +42,7 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } summary {
 {% endif %}</td>{% endfor %}
 </tr>{% endfor %}</tbody></table></div>{% endif %}
 {% if section.image %}<img alt="{{ section.title }}" width="{{ section.width }}"
- src="data:image/png;base64,{{ section.image }}">{% endif %}
+ src="data:image/{{ section.image }}">{% endif %}
 {% if section.after %}<p>{{ section.after }}</p>{% endif %}{% endfor %}
 <h2>Go on</h2><pre>{{ commands }}</pre>
 <h2>Configuration</h2><details><summary>Every key, as resolved</summary><pre>{{ config }}</pre></details>
@@ -100,6 +100,18 @@ FIGURES = {
         "On test episodes, each error in units of the standard deviation that the model claims for it. Inside the grey the "
         "errors have no memory. A wrong model can pass where its process noise is large: then it is corrected in every row.",
     ),
+    "control/learning_curves": (
+        "Learning the policy",
+        "What the mean of the policy earns, at looks along its training; a jump at the end is fine-tuning. The run keeps "
+        "the best in the model; the truth chooses nothing.",
+    ),
+    "control/returns": (
+        "Returns",
+        "What every episode earned in the plant, and what the model had promised beforehand. A promise far above what is kept "
+        "is a policy that exploits the model. A surprise (NLL) that falls is a model that learns.",
+    ),
+    "control/trajectories": ("Courses", "Every state and command of the episodes. An angle runs on beyond a turn."),
+    "control/manoeuvre": ("The manoeuvre", "Of the last episode of an online run, else of that of the median return."),
     "errors": (
         "Error by horizon",
         "Root mean square on test episodes with 95 % intervals over episodes. No error can fall below the measurement noise.",
@@ -107,18 +119,26 @@ FIGURES = {
 }
 
 
-def figure(path: Path) -> dict[str, Any]:
+def figure(path: Path, name: str = "") -> dict[str, Any]:
     """Return a section with a figure, embedded.
 
     Args:
-        path: of the PNG; its stem chooses heading and note.
+        path: of the PNG or GIF.
+        name: chooses heading and note; left out: the file's stem.
     """
-    title, note = FIGURES.get(path.stem, (path.stem.replace("_", " "), ""))
+    title, note = FIGURES.get(name or path.stem, (path.stem.replace("_", " "), ""))
     content = path.read_bytes()
-    width = round(
-        int.from_bytes(content[16:20], "big") * SCREEN / DPI
-    )  # of the PNG's header, so that all text is one size
-    return {"title": title, "note": note, "image": base64.b64encode(content).decode(), "width": width}
+    # of the file's header, so that all text is one size
+    moving = path.suffix == ".gif"
+    pixels = int.from_bytes(content[6:8], "little") if moving else int.from_bytes(content[16:20], "big")
+    width = pixels if moving else round(pixels * SCREEN / DPI)
+    kind = "gif" if moving else "png"
+    return {
+        "title": title,
+        "note": note,
+        "image": f"{kind};base64,{base64.b64encode(content).decode()}",
+        "width": width,
+    }
 
 
 def write_report(

@@ -212,7 +212,7 @@ def _publish(
     for seed, share in zip(seeds, flown.broken, strict=True):
         if share:
             terminal.line(f"seed {seed}: {100 * share:.0f} % of the roll-outs in the model diverged", "diverged")
-    images = draw_control(directory, asked.task.horizon) if study.settings.figures else []
+    images = draw_control(directory) if study.settings.figures else []
     run = f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed"
     commands = [
         *([run] if flown.policies is not None else []),
@@ -233,7 +233,10 @@ def _publish(
             if asked.planner is None
             else f"planned {asked.planner.ahead} steps ahead in the model; no policy is learned."
         ),
-        sections=[{"title": "Returns", "head": head, "rows": rows, "note": note}, *(figure(path) for path in images)],
+        sections=[
+            {"title": "Returns", "head": head, "rows": rows, "note": note},
+            *(figure(path, f"control/{path.stem}") for path in images),
+        ],
         commands=commands,
         config=dump(config),
     )

@@ -362,7 +362,10 @@ def _publish(loop: Loop) -> None:
         title=f"simpel rl-online · {loop.settings.name} · {loop.config['choices'].get('method', '')}",
         lead=f"{loop.online.episodes} episodes of {loop.asked.task.horizon} steps in {loop.config['world']}; no data before "
         "the first, whose policy was learned in the prior.",
-        sections=[{"title": "Episodes", "head": head, "rows": rows}, *(figure(path) for path in images)],
+        sections=[
+            {"title": "Episodes", "head": head, "rows": rows},
+            *(figure(path, f"control/{path.stem}") for path in images),
+        ],
         commands=commands,
         config=dump(loop.config),
     )

@@ -23,8 +23,8 @@ FRAMES = 100
 DURATION = 67  # of a frame, ms
 
 
-def draw_control(directory: Path, horizon: int) -> list[Path]:
-    """Draw what a run's Parquet files tell; the film is not part of the list."""
+def draw_control(directory: Path) -> list[Path]:
+    """Draw what a run's Parquet files tell; of a car in the plane a film, too."""
     made = []
     rows = [r for r in read_metrics(directory / "metrics.parquet") if r["split"] == "train"]
     if rows:
@@ -34,7 +34,7 @@ def draw_control(directory: Path, horizon: int) -> list[Path]:
         table, units = columns_of(path), units_of(path)
         made.append(save(_paths(table, units), directory / "trajectories.png"))
         if {"x", "y", "theta"} <= set(table):
-            _film(_median(table), units, directory / "manoeuvre.gif")
+            made.append(_film(_median(table), units, directory / "manoeuvre.gif"))
     return made
 
 
@@ -45,9 +45,8 @@ def draw_online(directory: Path) -> list[Path]:
     tables = [columns_of(path) for path in files]
     made.append(save(_courses(tables, units_of(files[0])), directory / "trajectories.png"))
     if {"x", "y", "theta"} <= set(tables[-1]):
-        _film(
-            {name: tables[-1][name] for name in ("x", "y", "theta")}, units_of(files[-1]), directory / "manoeuvre.gif"
-        )
+        last = tables[-1] | {"step": np.arange(len(tables[-1]["x"]))}
+        made.append(_film(last, units_of(files[-1]), directory / "manoeuvre.gif"))
     return made
 
 
@@ -83,9 +82,7 @@ def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
         if plane:
             axes[0].plot(table["x"], table["y"], label=label, **style)
         for axis, name in zip(axes[plane:], names, strict=True):
-            # an angle runs on: a jump by a turn is none
-            course = np.unwrap(table[name]) if units[name] == "rad" else table[name]
-            axis.plot(table["t"], course, label=None if plane else label, **style)
+            axis.plot(table["t"], _course(table[name], units[name]), label=None if plane else label, **style)
     if plane:
         axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
         axes[0].set(title="paths", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]))
@@ -95,6 +92,11 @@ def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
     if len(tables) > 1:
         legend_below(figure, axes[0])
     return figure
+
+
+def _course(values: np.ndarray, unit: str) -> np.ndarray:
+    """An angle runs on: a jump by a turn is none."""
+    return np.unwrap(values) if unit == "rad" else values
 
 
 def _curves(rows: list[dict[str, Any]]) -> Any:
@@ -124,7 +126,7 @@ def _paths(table: dict[str, np.ndarray], units: dict[str, str]) -> Any:
         if plane:
             axes[0].plot(table["x"][own][order], table["y"][own][order], **style)
         for axis, name in zip(axes[plane:], names, strict=True):
-            axis.plot(table["step"][own][order], table[name][own][order], **style)
+            axis.plot(table["step"][own][order], _course(table[name][own][order], units[name]), **style)
     if plane:
         axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
         axes[0].set(
@@ -144,20 +146,20 @@ def _median(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     median = numbers[int(np.argsort(returns)[len(returns) // 2])]
     own = first & (table["episode"] == median)
     order = np.argsort(table["step"][own])
-    return {name: table[name][own][order] for name in ("x", "y", "theta")}
+    return {name: table[name][own][order] for name in ("step", "x", "y", "theta")}
 
 
-def _film(table: dict[str, np.ndarray], units: dict[str, str], path: Path) -> None:
+def _film(table: dict[str, np.ndarray], units: dict[str, str], path: Path) -> Path:
     """Draw the course of x, y and theta as a car on the plane, with the steps counted above it."""
     from PIL import Image
 
-    x, y, theta = (table[name] for name in ("x", "y", "theta"))
+    x, y, theta, step = (table[name] for name in ("x", "y", "theta", "step"))
     every = max(1, len(x) // FRAMES)
     figure, (axis,) = new_figure(1, 4.5, 4.0)
     margin = 0.5
     axis.set(
         xlim=(min(x.min(), 0) - margin, max(x.max(), 0) + margin), ylim=(min(y.min(), 0) - margin, max(y.max(), 0) + margin),
-        aspect="equal", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]), title="step 0",
+        aspect="equal", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"]), title="step",
     )  # fmt: skip
     axis.plot(0, 0, "+", color=BLACK, markersize=12)
     (trail,) = axis.plot([], [], color=COLOURS[0], linewidth=1)
@@ -169,8 +171,9 @@ def _film(table: dict[str, np.ndarray], units: dict[str, str], path: Path) -> No
         turn = np.array([[np.cos(theta[k]), np.sin(theta[k])], [-np.sin(theta[k]), np.cos(theta[k])]])
         trail.set_data(x[: k + 1], y[: k + 1])
         car.set_data(*(outline @ turn + [x[k], y[k]]).T)
-        axis.set_title(f"step {k}")
+        axis.set_title(f"step {step[k]}")
         figure.canvas.draw()
         frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
     with replacing(path) as temporary:
         frames[0].save(temporary, format="GIF", save_all=True, append_images=frames[1:], duration=DURATION, loop=0)
+    return path
