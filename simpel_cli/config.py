@@ -9,7 +9,7 @@ import re
 import secrets
 import sys
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,9 @@ class Job(typing.NamedTuple):
     data_folder: Path  # folder of the data YAML: relative paths of measurements start there
     words: str = ""  # the overrides that tell this job from the others of a sweep
     given: tuple[str, ...] = ()  # all overrides, as typed
+    verb: str = "fit"
+    sweep: Path | None = None  # directory of the sweep that it is a job of
+    launcher: dict[str, Any] = {}  # noqa: RUF012  options of the sweep's launcher
 
 
 class _Stopped(BaseException):
@@ -64,7 +67,7 @@ class _Stopped(BaseException):
 
 
 def launch(
-    verb: str, task: Callable[[Job], Any], overrides: list[str], *, config_dir: Path | None, flags: list[str]
+    verb: str, task: Callable[[Job], Any], overrides: list[str], *, config_dir: Path | None, flags: Sequence[str] = ()
 ) -> None:
     """Compose `conf/<verb>.yaml` with overrides and run `task`; multirun, `--cfg job` and launchers are Hydra's.
 
@@ -82,15 +85,19 @@ def launch(
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
+    from simpel_cli import launcher
+
     words = checked(_appended(verb, overrides))
     user = _user_conf(config_dir)
     if "--cfg" not in flags:
         _refuse_other_runs(overrides)
     register_resolvers()
+    launcher.register()
     known, swept = _top_level(verb), swept_keys(overrides)
     typed = {word.lstrip("+~").partition("=")[0].partition(".")[0] for word in overrides}
 
     def entry(config: Any) -> Any:
+        register_resolvers()  # a launcher may have carried this to another process
         try:
             hydra_config = HydraConfig.get()
             plain = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
@@ -104,7 +111,22 @@ def launch(
                 plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with
             given = [w.removeprefix("++") for w in hydra_config.overrides.task]
             told = " ".join(w for w in given if w.partition("=")[0] in swept)
-            return task(Job(plain, directory, folder, told, tuple(given)))
+            sweep = launching = None
+            if hydra_config.mode is not None and hydra_config.mode.name == "MULTIRUN":
+                sweep = Path(hydra_config.sweep.dir).absolute()
+                launching = {k: v for k, v in (hydra_config.launcher or {}).items() if k != "_target_"}
+            return task(
+                Job(
+                    plain,
+                    directory,
+                    folder,
+                    told,
+                    tuple(given),
+                    "fit" if verb == "sweep" else verb,
+                    sweep,
+                    launching or {},
+                )
+            )
         except Exception as error:
             raise _Stopped from error
 
@@ -133,6 +155,19 @@ def count_jobs(overrides: list[str]) -> int:
 
     parsed = OverridesParser.create().parse_overrides(checked(overrides))
     return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
+
+
+def value_of(key: str, overrides: list[str]) -> str | None:
+    """Return the text that the last override of a key gives it; None: there is none."""
+    found = [re.fullmatch(rf"\+*{re.escape(key)}=(['\"]?)(.*)\1", word) for word in overrides]
+    return next((match[2] for match in reversed(found) if match), None)
+
+
+def sweep_directory() -> Path | None:
+    """Return the directory of the multirun that this process has started last."""
+    from simpel_cli import launcher
+
+    return launcher.directories[-1] if launcher.directories else None
 
 
 def swept_keys(overrides: list[str]) -> set[str]:
@@ -230,9 +265,8 @@ def _user_conf(config_dir: Path | None) -> Path | None:
 
 def _refuse_other_runs(overrides: list[str]) -> None:
     """Look into a run directory that the user names before Hydra writes to it."""
-    for word in overrides:
-        if found := re.fullmatch(r"\+*hydra\.run\.dir=['\"]?(.*?)['\"]?", word):
-            refuse_occupied(Path(found[1]))
+    if (given := value_of("hydra.run.dir", overrides)) is not None:
+        refuse_occupied(Path(given))
 
 
 def _group_folder(group: str, choice: str | None, user: Path | None) -> Path:

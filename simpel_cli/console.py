@@ -2,13 +2,15 @@
 
 import os
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
 
 class _Screen(Console):
@@ -41,7 +43,9 @@ class Terminal:
     def line(self, text: str = "", label: str = "", style: str = "") -> None:
         """Print a line, with a label in its own column."""
         shown = f"{label:<10}{text}" if label else text
-        self.console.print(shown, style=style, markup=False, soft_wrap=True)
+        self.console.print(
+            Text(shown, style=style), soft_wrap=True
+        )  # a style of the whole print would be a board's, too
         if shown and self.log is not None:
             now = datetime.now()
             with self.log.open("a") as file:
@@ -63,3 +67,48 @@ class Terminal:
                 bar.update(task, completed=step, note=note)
 
             yield update
+
+
+class Board:
+    """What runs at the moment, redrawn below the lines; nothing where nobody looks.
+
+    Args:
+        terminal: whose lines stay above it.
+    """
+
+    def __init__(self, terminal: Terminal) -> None:
+        from rich.live import Live
+
+        self._began: dict[str, float] = {}
+        self._drawn = 0.0
+        self._live: Any = None
+        if terminal.console.is_terminal and not terminal.console.quiet:
+            self._live = Live(console=terminal.console, auto_refresh=False, transient=True)
+
+    def show(self, running: Callable[[], list[tuple[str, str]]]) -> None:
+        """Draw it, at most once a second.
+
+        Args:
+            running: gives name and state of everything that runs.
+        """
+        from rich.table import Table
+
+        now = time.monotonic()
+        if self._live is None or now - self._drawn < 1.0:
+            return
+        self._drawn = now
+        found = running()
+        self._began = {name: self._began.get(name, now) for name, _ in found}
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        for name, state in found:
+            table.add_row(Text("running", style="dim"), Text(name), Text(state), f"{now - self._began[name]:.0f} s")
+        self._live.update(table, refresh=True)
+
+    def __enter__(self) -> "Board":
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()

@@ -5,11 +5,8 @@ checkpoints lie at the ends of stretches: a resumed run repeats bit for bit what
 vmapped; problem arrays are arguments, so that runs of the same shapes share one compiled program.
 """
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -18,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
+from simpel_cli.interruption import interruption
 
 
 @runtime_checkable
@@ -133,45 +131,6 @@ def train(program: Program, steps: int, *, state: Any = None, start: int = 0) ->
             yield Stretch(start, state, info)
             if interrupted.is_set() and start < steps:
                 raise Interrupted(f"stopped at step {start} of {steps}; the state is saved.")
-
-
-_interruptions: list[threading.Event] = []  # of the main thread: none, or the one that is going on
-
-
-@contextmanager
-def interruption() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C or SIGTERM sets; a second Ctrl-C acts at once. Within another, gives that one's event."""
-    if threading.current_thread() is not threading.main_thread():
-        yield threading.Event()
-        return
-    if _interruptions:
-        yield _interruptions[0]
-        return
-    event = threading.Event()
-
-    def note(number: int, frame: object) -> None:
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    _interruptions.append(event)
-    try:
-        yield event
-    finally:
-        _interruptions.clear()
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def stop_if(interrupted: threading.Event) -> None:
-    """Stop between two pieces of work, of which each keeps what it came to.
-
-    Raises:
-        Interrupted: Ctrl-C or SIGTERM came meanwhile.
-    """
-    if interrupted.is_set():
-        raise Interrupted("stopped; what is complete is kept.")
 
 
 def _refuse_non_finite(info: Any, start: int) -> None:

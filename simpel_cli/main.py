@@ -85,12 +85,10 @@ def fit(
         from simpel_cli.commands.fit import resume as go_on
 
         go_on(resume)
-    elif multirun:
-        sweep(overrides, config_dir, cfg)
     else:
         from simpel_cli.commands.fit import fit as task
 
-        _launch("fit", task, overrides, config_dir, cfg)
+        _launch("fit", task, overrides, config_dir, cfg, multirun)
 
 
 @app.command()
@@ -124,6 +122,7 @@ def discover(
     overrides: Overrides = None,
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
+    multirun: Multirun = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 5 unless the verdict is `effect`.")] = False,
 ) -> None:
     """Find what the simulator leaves unexplained, name the cause, add it, and report the error before and after.
@@ -137,7 +136,7 @@ def discover(
 
     from simpel_cli.commands.discover import discover as task
 
-    _launch("discover", partial(task, strict=strict), overrides, config_dir, cfg)
+    _launch("discover", partial(task, strict=strict), overrides, config_dir, cfg, multirun)
 
 
 @app.command("rl-offline")
@@ -145,6 +144,7 @@ def rl_offline(
     overrides: Overrides = None,
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
+    multirun: Multirun = False,
     resume: Annotated[Path | None, typer.Option(help="Go on with an interrupted run.")] = None,
 ) -> None:
     """Learn a policy in a model that was fitted to measurements, and judge it in the true world.
@@ -155,14 +155,14 @@ def rl_offline(
       simpel rl-offline --config-dir my sim=rig data=rig reward=my_task sim@truth=rig_as_i_know_it
     """
     if resume is not None:
-        _refuse_more(resume, overrides, config_dir, cfg)
+        _refuse_more(resume, overrides, config_dir, cfg, multirun)
         from simpel_cli.commands.rl_offline import resume as go_on
 
         go_on(resume)
     else:
         from simpel_cli.commands.rl_offline import rl_offline as task
 
-        _launch("rl-offline", task, overrides, config_dir, cfg)
+        _launch("rl-offline", task, overrides, config_dir, cfg, multirun)
 
 
 @app.command("rl-online")
@@ -170,6 +170,7 @@ def rl_online(
     overrides: Overrides = None,
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
+    multirun: Multirun = False,
     resume: Annotated[Path | None, typer.Option(help="Go on with an interrupted run.")] = None,
 ) -> None:
     """Act, measure, learn a model and a policy, act again, without data to begin with.
@@ -180,28 +181,41 @@ def rl_online(
       simpel rl-online --config-dir my sim=rig reward=my_task world=folder:exchange
     """
     if resume is not None:
-        _refuse_more(resume, overrides, config_dir, cfg)
+        _refuse_more(resume, overrides, config_dir, cfg, multirun)
         from simpel_cli.commands.rl_online import resume as go_on
 
         go_on(resume)
     else:
         from simpel_cli.commands.rl_online import rl_online as task
 
-        _launch("rl-online", task, overrides, config_dir, cfg)
+        _launch("rl-online", task, overrides, config_dir, cfg, multirun)
 
 
 @app.command()
-def sweep(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
-    """Fit every combination of values and collect the results.
+def sweep(
+    overrides: Overrides = None,
+    config_dir: ConfigDir = None,
+    cfg: Cfg = None,
+    resume: Annotated[Path | None, typer.Option(help="Run what is missing or failed of a sweep.")] = None,
+) -> None:
+    """Fit every combination of values and collect the results; other verbs sweep with -m.
 
     Examples:
       simpel sweep experiment=pendulum method=simpel,fsvgd data.n_train=10,20,40 'run.seed=range(3)'
 
       simpel sweep --config-dir my sim=rig data=rig data.n_train=20,80 'run.seed=range(5)'
-    """
-    from simpel_cli.commands.sweep import sweep as task
 
-    task(overrides or [], config_dir, cfg)
+      simpel sweep experiment=pendulum 'run.seed=range(100)' hydra.launcher.address=tcp://cluster:8786
+
+      simpel sweep --resume runs/sweep/pendulum/20261121-101502-3fa9
+    """
+    if resume is not None:
+        _refuse_more(resume, config_dir, cfg)
+        from simpel_cli.commands.sweep import resume as go_on
+
+        go_on(resume, overrides or [])
+    else:
+        _launch("fit", None, overrides, config_dir, cfg, multirun=True)
 
 
 @app.command()
@@ -228,11 +242,17 @@ def _refuse_more(resume: Path, *given: object) -> None:
 
 def _launch(
     verb: str,
-    task: Callable[["Job"], None],
+    task: Callable[["Job"], None] | None,
     overrides: list[str] | None,
     config_dir: Path | None,
     cfg: str | None,
+    multirun: bool = False,
 ) -> None:
+    if multirun or task is None:
+        from simpel_cli.commands.sweep import sweep as every
+
+        every(verb, overrides or [], config_dir, cfg)
+        return
     from simpel_cli.config import launch
 
     launch(verb, task, overrides or [], config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])

@@ -17,6 +17,11 @@ from typing import TYPE_CHECKING, Any
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.records import write_text
 
+try:
+    import fcntl
+except ImportError:  # Windows: two processes in one directory are not told apart there
+    fcntl = None  # type: ignore[assignment]
+
 if TYPE_CHECKING:
     import jax
     from jaxtyping import PRNGKeyArray
@@ -144,6 +149,7 @@ class Manifest:
     inputs: dict[str, str] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
+    _lock: Any = None
 
     def write(self, status: str, error: str | None = None) -> None:
         """Write the manifest with a status: running, done, interrupted or failed."""
@@ -175,6 +181,7 @@ class Manifest:
         self.inputs |= {str(f): sha256(f) for f in files}
 
     def __enter__(self) -> "Manifest":
+        self._lock = locked(self.directory)
         self.write("running")
         return self
 
@@ -186,6 +193,42 @@ class Manifest:
         else:
             text = str(error) if isinstance(error, SimpelError) else f"{type(error).__name__}: {error}"
             self.write("failed", text)
+        self._lock.close()
+
+
+def locked(directory: Path) -> Any:
+    """Take a directory for this process; it is free again when what is returned is closed, or the process ends.
+
+    Raises:
+        ConfigError: another process works in it.
+    """
+    file = (directory / ".lock").open("a+")
+    if fcntl is None:  # pragma: no cover
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.seek(0)
+        who = file.read().strip() or "another process"
+        file.close()
+        raise ConfigError(
+            f"{directory}: {who} is at work there. Wait until it ends, or stop it; nothing was changed."
+        ) from error
+    file.truncate(0)
+    file.write(f"process {os.getpid()} on {platform.node()}")
+    file.flush()
+    return file
+
+
+def is_locked(directory: Path) -> bool:
+    """Return whether a process is at work in a directory."""
+    if not (directory / ".lock").exists():
+        return False
+    try:
+        locked(directory).close()
+    except ConfigError:
+        return True
+    return False
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

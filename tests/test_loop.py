@@ -10,6 +10,7 @@ import pytest
 
 from simpel_cli import loop
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
+from simpel_cli.interruption import interruption
 
 RATE, DIM = 0.1, 3
 
@@ -163,7 +164,7 @@ def test_a_signal_during_the_last_stretch_changes_nothing(tens: loop.Program) ->
 
 
 def test_a_second_signal_acts_at_once() -> None:
-    with loop.interruption() as event:
+    with interruption() as event:
         signal.raise_signal(signal.SIGINT)
         assert event.is_set()
         with pytest.raises(KeyboardInterrupt):

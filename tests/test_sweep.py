@@ -1,71 +1,209 @@
-"""Sweeps with tiny settings: what fails, dies or is stopped costs itself only."""
+"""Sweeps with tiny settings: what fails, dies or is stopped costs itself only, and is gone on with."""
 
 import json
 import os
 import signal
 import subprocess
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from command_line import FIT, PATIENCE, TINY, process, rows, simpel, start
+from command_line import FIT, PATIENCE, TINY, environment, process, rows, simpel, start
+
+from simpel_cli.commands.cluster import Options
+from simpel_cli.errors import ConfigError
+from simpel_cli.run import is_locked, locked
+
+# long enough to be killed amid it; the same job several times, so that each says what the others should have come to
+LONG = ("experiment=pendulum", *TINY, "method.steps=12000", "run.quiet=false")
+SAME = (*LONG, "run.name=a,b,c", "hydra.sweep.dir=sweep", "hydra.launcher.workers=1")
 
 
-class TestSweep:
-    def test_a_job_that_fails_costs_itself_only(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1", "hydra.sweep.dir=sweep")
-        result = process(tmp_path, "sweep", *words)
+def values(run: Path) -> list[object]:
+    return [(r["metric"], r["output"], r["step"], r["value"]) for r in rows(run)]
+
+
+def statuses(sweep: Path, jobs: int) -> list[str]:
+    return [json.loads((sweep / str(i) / "manifest.json").read_text())["status"] for i in range(jobs)]
+
+
+def test_a_job_that_fails_costs_itself_only(tmp_path: Path) -> None:
+    words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1", "hydra.sweep.dir=sweep")
+    result = process(tmp_path, "sweep", *words)
+    assert result.code == 2
+    assert "1 of 2 jobs failed, the others are collected" in result.err
+    assert "method.learning_rate: got -1.0; it must be positive" in result.err
+    table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
+    assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
+    assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]
+    assert (tmp_path / "sweep" / "0" / "report.html").exists()
+    assert not list((tmp_path / "sweep" / "0").glob("*.png"))  # run.figures=false
+    single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
+    assert single.code == 0
+    assert [r["value"] for r in table] == [r["value"] for r in rows(tmp_path / "single", split="test")]
+    # a second sweep there is refused; going on runs what failed, with what it left set aside
+    again = simpel(tmp_path, "sweep", *words)
+    assert (again.code, "sweep holds a sweep already. Go on with `simpel sweep --resume sweep`" in again.err) == (
+        2,
+        True,
+    )
+    before = (tmp_path / "sweep" / "0" / "manifest.json").read_bytes()
+    resumed = process(tmp_path, "sweep", "--resume", "sweep", "run.quiet=false")
+    assert resumed.code == 2
+    assert "1 of 2 jobs failed" in resumed.err
+    assert "done before" in resumed.out
+    assert (tmp_path / "sweep" / "0" / "manifest.json").read_bytes() == before
+    assert (tmp_path / "sweep" / "1.failed-1" / "config.yaml").exists()
+
+
+def test_a_worker_that_is_killed_costs_one_retry(tmp_path: Path) -> None:
+    """`fit -m` is the same as `sweep`."""
+    with start(tmp_path, "fit", "-m", *SAME) as child:
+        wait_for(tmp_path / "sweep" / "1" / "checkpoint" / "state.safetensors", child)
+        os.kill(workers_of(child.pid)[0], signal.SIGKILL)
+        out, err = child.communicate(timeout=PATIENCE)
+    assert child.returncode == 0, err
+    assert "since its worker died or it was stopped" in out
+    assert statuses(tmp_path / "sweep", 3) == ["done"] * 3
+    assert values(tmp_path / "sweep" / "1") == values(tmp_path / "sweep" / "0")
+
+
+def test_ctrl_c_stops_it_and_resume_goes_on(tmp_path: Path) -> None:
+    with start(tmp_path, "sweep", *SAME, start_new_session=True) as child:
+        wait_for(tmp_path / "sweep" / "1" / "checkpoint" / "state.safetensors", child)
+        os.killpg(child.pid, signal.SIGINT)  # as a terminal does
+        out, err = child.communicate(timeout=PATIENCE)
+    assert child.returncode == 130
+    assert "stopped: the sweep was stopped; finished jobs are kept. `simpel sweep --resume" in err
+    assert "not done: 1" in out
+    assert "Traceback" not in out + err
+    assert statuses(tmp_path / "sweep", 2) == ["done", "interrupted"]
+    assert {row["run"] for row in pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()} == {"run.name=a"}
+    result = process(tmp_path, "sweep", "--resume", "sweep", "hydra.launcher.workers=2")
+    assert result.code == 0, result.err
+    assert statuses(tmp_path / "sweep", 3) == ["done"] * 3
+    assert values(tmp_path / "sweep" / "0") == values(tmp_path / "sweep" / "1") == values(tmp_path / "sweep" / "2")
+
+
+def test_its_workers_end_with_it(tmp_path: Path) -> None:
+    with start(tmp_path, "sweep", *SAME) as child:
+        wait_for(tmp_path / "sweep" / "0" / "manifest.json", child)
+        (worker,) = workers_of(child.pid)
+        child.kill()
+        child.communicate(timeout=PATIENCE)
+    end = time.monotonic() + PATIENCE
+    while is_running(worker):
+        assert time.monotonic() < end, "the worker goes on"
+        time.sleep(0.05)
+    assert not (tmp_path / "sweep" / "2" / "manifest.json").exists()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and two workers, each a process of its own, as somebody else has started them."""
+    dask = [sys.executable, "-m", "dask"]
+    file = tmp_path / "scheduler.json"
+    options = {"env": environment(), "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    own = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    processes = [subprocess.Popen([*dask, *own], **options)]
+    work = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+    processes += [subprocess.Popen([*dask, *work], **options) for _ in range(2)]
+    try:
+        wait_for(file, processes[0])
+        yield json.loads(file.read_text())["address"], processes[1:]
+    finally:
+        for each in processes:
+            each.kill()
+            each.wait()
+
+
+def test_a_cluster_that_runs_already_and_loses_a_worker(
+    tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
+) -> None:
+    address, workers = cluster
+    with start(tmp_path, "sweep", *SAME[:-1], f"hydra.launcher.address={address}") as child:
+        for number in (0, 1):
+            wait_for(tmp_path / "sweep" / str(number) / "checkpoint" / "state.safetensors", child)
+        workers[0].kill()
+        out, err = child.communicate(timeout=PATIENCE)
+    assert child.returncode == 0, err
+    assert f"at {address}" in out
+    assert out.count("since its worker died") == 1
+    assert statuses(tmp_path / "sweep", 3) == ["done"] * 3
+    assert values(tmp_path / "sweep" / "0") == values(tmp_path / "sweep" / "1") == values(tmp_path / "sweep" / "2")
+    assert workers[1].poll() is None  # it is not ours to end
+    assert not list((tmp_path / "sweep").glob(".seen*"))
+
+
+def test_another_launcher_of_hydra_runs_the_same_jobs(tmp_path: Path) -> None:
+    words = ["experiment=pendulum", *TINY, "run.quiet=false", "hydra.sweep.dir=sweep", "method.learning_rate=0.001,-1"]
+    result = simpel(tmp_path, "sweep", *words, "hydra/launcher=basic")
+    assert "not done: 1; `simpel sweep --resume" in result.out
+    assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]
+    table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
+    assert {row["run"] for row in table} == {"method.learning_rate=0.001"}
+    # what was done with one configuration is not taken for the outcome of another
+    record = json.loads((tmp_path / "sweep" / "sweep.json").read_text())
+    record["words"] = [*words[:-1], "method.learning_rate=0.002,0.003"]
+    (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(record))
+    changed = simpel(tmp_path, "sweep", "--resume", "sweep", "hydra.launcher.workers=1")
+    assert "0: done before with another configuration (method.learning_rate: 0.001, now 0.002)" in changed.err
+    assert statuses(tmp_path / "sweep", 2) == ["done", "done"]
+
+
+def test_two_sweeps_in_one_directory(tmp_path: Path) -> None:
+    sweep = tmp_path / "sweep"
+    sweep.mkdir()
+    with locked(sweep):
+        assert is_locked(sweep)
+        result = simpel(tmp_path, "sweep", "experiment=pendulum", *TINY, "run.seed=0,1", f"hydra.sweep.dir={sweep}")
         assert result.code == 2
-        assert "1 of 2 jobs failed, the others are collected" in result.err
-        assert "method.learning_rate: got -1.0; it must be positive" in result.err
-        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
-        status = [json.loads((tmp_path / "sweep" / str(i) / "manifest.json").read_text())["status"] for i in range(2)]
-        assert status == ["done", "failed"]
-        assert (tmp_path / "sweep" / "0" / "report.html").exists()
-        assert not list((tmp_path / "sweep" / "0").glob("*.png"))  # run.figures=false
-        single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
-        assert single.code == 0
-        assert [r["value"] for r in table] == [r["value"] for r in rows(tmp_path / "single", split="test")]
+        assert f"{sweep}: process {os.getpid()} on" in result.err
+        assert "is at work there. Wait until it ends, or stop it; nothing was changed." in result.err
+    assert not is_locked(sweep)
 
-    def test_a_worker_that_is_killed_costs_one_job(self, tmp_path: Path) -> None:
-        """`fit -m` is the same as `sweep`."""
-        words = ("experiment=pendulum", *TINY, "run.seed=0,1,2", "hydra.sweep.dir=sweep")
-        with start(tmp_path, "fit", "-m", *words) as child:
-            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
-            os.kill(worker_of(child.pid), signal.SIGKILL)
-            _, err = child.communicate(timeout=PATIENCE)
-        assert child.returncode == 1
-        assert "1 of 3 jobs failed" in err
-        assert "1: the worker process died (out of memory, or killed)" in err
-        table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
-        assert {row["seed"] for row in table} == {0, 2}
 
-    def test_ctrl_c_stops_it_and_keeps_what_is_done(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "run.seed=range(9)", "hydra.sweep.dir=sweep")
-        with start(tmp_path, "sweep", *words, start_new_session=True) as child:
-            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
-            os.killpg(child.pid, signal.SIGINT)  # as a terminal does
-            _, err = child.communicate(timeout=PATIENCE)
-        assert child.returncode == 130
-        assert "stopped: the sweep was stopped; finished jobs are kept." in err
-        assert "Traceback" not in err
-        assert not (tmp_path / "sweep" / "3").exists()
-        assert 0 in {row["seed"] for row in pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()}
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"workers": 0}, "hydra.launcher.workers: got 0; allowed are 1 to 1000, and null."),
+        ({"address": "cluster"}, "hydra.launcher.address: got cluster; it looks like tcp://HOST:PORT."),
+        ({"worker": 2}, "hydra.launcher.worker: no such key. Did you mean workers?"),
+        ({"memory": "much"}, "hydra.launcher.memory: got much; it looks like 4GB, or is `auto`."),
+        ({"dashboard": "yes"}, "hydra.launcher.dashboard: got yes; it is a port, or null."),
+    ],
+)
+def test_wrong_options(given: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        Options.of(given)
+    assert message in str(error.value)
 
-    def test_its_worker_ends_with_it(self, tmp_path: Path) -> None:
-        words = ("experiment=pendulum", *TINY, "run.seed=range(9)", "hydra.sweep.dir=sweep")
-        with start(tmp_path, "sweep", *words) as child:
-            wait_for(tmp_path / "sweep" / "1" / "manifest.json", child)
-            worker = worker_of(child.pid)
-            child.kill()
-            child.communicate(timeout=PATIENCE)
-        end = time.monotonic() + PATIENCE
-        while is_running(worker):
-            assert time.monotonic() < end, "the worker goes on"
-            time.sleep(0.05)
-        assert not (tmp_path / "sweep" / "3").exists()
+
+def test_nobody_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simpel_cli.commands.cluster.PATIENCE", 0.5)
+    words = ("experiment=pendulum", *TINY, "run.seed=0,1", "hydra.sweep.dir=sweep")
+    result = simpel(tmp_path, "sweep", *words, "hydra.launcher.address=tcp://127.0.0.1:9")
+    assert result.code == 2
+    assert "hydra.launcher.address: no scheduler answers at tcp://127.0.0.1:9 within" in result.err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--resume", "nowhere"), "nowhere: not the directory of a sweep (it has no sweep.json)"),
+        (("--resume", "."), "sweep.json: not readable"),
+        (("--resume", ".", "method.steps=2"), "--resume: method.steps=2 is not of the launcher"),
+    ],
+)
+def test_wrong_resumes(tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+    good = '{"verb": "fit", "words": [], "config_dir": null, "jobs": 1}'
+    (tmp_path / "sweep.json").write_text(good if len(words) > 2 else "{}")
+    result = simpel(tmp_path, "sweep", *words)
+    assert result.code == 2
+    assert message in result.err
 
 
 def is_running(pid: int) -> bool:
@@ -77,20 +215,22 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120) -> None:
+def wait_for(path: Path, child: subprocess.Popen[str] | subprocess.Popen[bytes], seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not path.exists():
-        assert child.poll() is None, child.communicate()[1]
+        assert child.poll() is None, child.communicate()
         assert time.monotonic() < end, f"{path} did not appear"
         time.sleep(0.02)
 
 
-def worker_of(parent: int) -> int:
-    """Return the process of a sweep that works (not multiprocessing's resource tracker)."""
+def workers_of(parent: int) -> list[int]:
+    """Return the processes of a sweep that work (not multiprocessing's resource tracker)."""
     children = Path(f"/proc/{parent}/task/{parent}/children")
     if not children.exists():
         pytest.skip("no /proc: cannot find the worker process")
-    for pid in children.read_text().split():
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            return int(pid)
-    raise AssertionError("no worker process")
+    found = []
+    for task in Path(f"/proc/{parent}/task").iterdir():  # a process is the child of the thread that started it
+        pids = (task / "children").read_text().split()
+        found += [int(pid) for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert found, "no worker process"
+    return found

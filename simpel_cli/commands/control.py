@@ -19,6 +19,7 @@ from simpel_cli.data.recording import Source
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
+from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.nodes import build
 from simpel_cli.records import MetricStream
 from simpel_cli.rl.comparable import check_comparable
@@ -279,7 +280,7 @@ def train(
         state = sac.begun_with(program.init(problems, keys), last)
     began = time.perf_counter()
     per = sac.side_by_side(multiple) * sac.collect
-    with loop.interruption() as interrupted, terminal.progress(label, iterations, start) as update:
+    with interruption() as interrupted, terminal.progress(label, iterations, start) as update:
         for one in loop.train(program, iterations, state=state, start=start):
             now = policies_of(problems, one.state)
             earned, broken = model_judge(problems, now, stream(0, "judge"))
@@ -288,7 +289,7 @@ def train(
             metrics.add(_rows(seeds, sac.policies, one.step * per, np.asarray(earned), np.asarray(broken), true))
             keep(directory, (one.state, best), {"step": one.step, "world_steps": one.step * per, "command": "policy"})
             update(one.step, _said(best, true))
-        loop.stop_if(interrupted)
+        stop_if(interrupted)
     assert best is not None
     if rival is not None:
         own = jax.tree.map(lambda a, b: jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape), rival, best.policy)

@@ -12,7 +12,7 @@ from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
-from simpel_cli.loop import interruption, stop_if
+from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.plots.canvas import with_interval
 from simpel_cli.plots.control import draw_control
 from simpel_cli.records import MetricStream, load_checkpoint, write_table, write_text

@@ -19,7 +19,7 @@ from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
-from simpel_cli.loop import interruption, stop_if
+from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.nodes import build
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online

@@ -1,195 +1,227 @@
-"""`simpel sweep`: fit every combination of values through Hydra's multirun, collect what is complete.
+"""`simpel sweep`, and `-m` of every verb: run every combination of values, collect what is complete.
 
-Jobs run one after another in a worker process that is kept, so that imports and compiled programs are shared. A job
-that fails, or a worker that dies, costs that job only.
+Hydra composes the jobs. Its launcher `dask` hands them to workers of `commands.cluster`; any other launcher of Hydra runs
+each where it likes, and finds the same `perform`. A job that fails, or a worker that dies, costs that job only.
 """
 
 import contextlib
-import multiprocessing
-import multiprocessing.connection
-import os
-import signal
 import threading
-import traceback
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
-from simpel_cli.config import Job, count_jobs, launch
-from simpel_cli.console import Terminal
-from simpel_cli.errors import Interrupted, SimpelError
-from simpel_cli.plots import draw_sweep
-from simpel_cli.records import read_metrics, write_metrics
-from simpel_cli.run import read_manifest
+from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
+from simpel_cli.commands.job import Outcome, perform
+from simpel_cli.config import Job, count_jobs, launch, sweep_directory, value_of
+from simpel_cli.console import Board, Terminal
+from simpel_cli.errors import ConfigError, Interrupted, SimpelError
+from simpel_cli.interruption import interruption
+from simpel_cli.launcher import NAME
+from simpel_cli.run import locked
 
-
-class Outcome(NamedTuple):
-    """How a job ended."""
-
-    directory: Path
-    code: int  # exit code that the job would have had as a command
-    error: str
-    words: str = ""  # the overrides that tell this job from the others
+LOOK = 0.2  # s between two looks at what has ended
+GRACE = 300.0  # s that running jobs have to save their state
 
 
-class Jobs:
-    """Runs jobs in a worker process and replaces the worker when it dies.
+class Sweep:
+    """Queues jobs, shows how they end, and keeps the outcomes.
 
     Args:
-        total: number of jobs of the sweep.
+        record: of the sweep.
         terminal: where a line per job goes.
+        stop: set when the user wants it to end.
     """
 
-    def __init__(self, total: int, terminal: Terminal) -> None:
-        self.total, self.terminal = total, terminal
+    def __init__(self, record: Record, terminal: Terminal, stop: threading.Event) -> None:
+        self.record, self.terminal, self.stop = record, terminal, stop
         self.outcomes: list[Outcome] = []
-        self._pool: ProcessPoolExecutor | None = None
+        self.root: Path | None = None
+        self._cluster: Any = None
+        self._queued = 0
         self._began = perf_counter()
+        self._board = Board(terminal)
+        self._open = contextlib.ExitStack()
 
-    def run(self, job: Job) -> None:
-        """Run one job and note how it ended; raises only when the user stops the sweep."""
-        quiet = job._replace(config=job.config | {"run": (job.config.get("run") or {}) | {"quiet": True}})
-        began = perf_counter()
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin)
-        with _without_ctrl_c():  # a new process inherits it, and is not stopped amid its imports
-            future = self._pool.submit(_work, quiet)
-        try:
-            outcome = future.result()
-        except BrokenProcessPool:
-            self._pool = None
-            outcome = Outcome(job.directory, 1, "the worker process died (out of memory, or killed)")
-        except KeyboardInterrupt:
-            # the worker got the same Ctrl-C: it saves its state at the end of its stretch
-            with contextlib.suppress(BrokenProcessPool, KeyboardInterrupt):
-                self.outcomes.append(future.result(timeout=60))
-            raise Interrupted("the sweep was stopped; finished jobs are kept.") from None
-        outcome = outcome._replace(words=job.words)
-        self.outcomes.append(outcome)
-        self._say(job, outcome, perf_counter() - began)
-        if outcome.code == Interrupted.exit_code:
-            raise Interrupted("the sweep was stopped; finished jobs are kept.")
+    def add(self, job: Job) -> None:
+        """Queue a job.
+
+        Raises:
+            Interrupted: the user stopped the sweep.
+            ConfigError: the workers cannot be had, or another process is at work in the directory.
+        """
+        if self._cluster is None:
+            self._start(job)
+        self._cluster.submit(job)
+        self._queued += 1
+        self._look(0.0)
+
+    def wait(self) -> None:
+        """Wait until every queued job has ended.
+
+        Raises:
+            Interrupted: the user stopped the sweep.
+        """
+        while len(self.outcomes) < self._queued:
+            self._look(LOOK)
 
     def close(self) -> None:
-        """End the worker."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        """End the workers."""
+        self._open.close()
 
-    def _say(self, job: Job, outcome: Outcome, seconds: float) -> None:
-        done = len(self.outcomes)
-        left = (perf_counter() - self._began) / done * (self.total - done)
-        what = f"error: {outcome.error}" if outcome.code else _result(outcome.directory)
+    def _start(self, job: Job) -> None:
+        from simpel_cli.commands.cluster import Cluster, Options
+
+        options = Options.of(job.launcher)
+        assert job.sweep is not None
+        self.root = job.sweep
+        self._open.enter_context(contextlib.closing(locked(self.root)))
+        write_record(self.root, self.record)
+        self._cluster = Cluster(options, self.record.jobs, self.root)
+        self._open.enter_context(contextlib.closing(self._cluster))
+        self._open.enter_context(self._board)
+        count = self._cluster.workers
+        where = f"at {options.address}" if options.address else "on this machine"
+        self.terminal.line(f"{count} {'worker' if count == 1 else 'workers'} {where}", "workers")
+        if self._cluster.dashboard:
+            self.terminal.line(self._cluster.dashboard, "dashboard")
+        self._began = perf_counter()
+
+    def _look(self, seconds: float) -> None:
+        for outcome in self._cluster.ended(seconds):
+            self.outcomes.append(outcome)
+            self._say(outcome)
+        self._board.show(self._running)
+        if self.stop.is_set():
+            self._end()
+
+    def _end(self) -> None:
+        """Stop what runs, so that it can be gone on with."""
+        self.terminal.line("stopping: running jobs save their state", style="yellow")
+        self._cluster.stop()
+        end = perf_counter() + GRACE
+        while self._cluster.running and perf_counter() < end:
+            self.outcomes += self._cluster.ended(LOOK)
+        raise Interrupted(
+            f"the sweep was stopped; finished jobs are kept. `simpel sweep --resume {self.root}` goes on."
+        )
+
+    def _say(self, outcome: Outcome) -> None:
+        done, total = len(self.outcomes), self.record.jobs
+        if outcome.code:
+            what = f"error: {outcome.error}"
+        elif not outcome.seconds:
+            what = "done before"
+        else:
+            what = headline(outcome.directory)
+        took = f"{outcome.seconds:.0f} s" + (" since its worker died or it was stopped" if outcome.resumed else "")
         self.terminal.line(
-            f"{done}/{self.total}  {job.words}  {what}  {seconds:.0f} s, about {left / 60:.0f} min left",
+            "  ".join(
+                filter(None, (f"{done}/{total}", outcome.words, what, took if outcome.seconds else "", self._left()))
+            ),
             style="red" if outcome.code else "",
         )
 
+    def _left(self) -> str:
+        """Return about how long the rest takes."""
+        ran = sum(outcome.seconds > 0 for outcome in self.outcomes)
+        left = self.record.jobs - len(self.outcomes)
+        if not ran or not left:
+            return ""
+        minutes = (perf_counter() - self._began) / ran * left / 60
+        return f"about {minutes:.0f} min left" if minutes >= 1 else "less than a minute left"
 
-def sweep(overrides: list[str], config_dir: Path | None, cfg: str | None) -> None:
-    """Run the sweep and collect it.
+    def _running(self) -> list[tuple[str, str]]:
+        """Return what runs, for the board: words, and how far it is."""
+        return [(job.words or job.directory.name, _progress(job)) for job in self._cluster.running]
+
+
+def sweep(verb: str, overrides: list[str], config_dir: Path | None, cfg: str | None) -> None:
+    """Run a new sweep and collect it.
 
     Raises:
         SimpelError: a job failed; everything else was collected, and the error says where.
     """
-    total = count_jobs(overrides)
-    quiet = any(o.replace(" ", "").lower() == "run.quiet=true" for o in overrides)
-    terminal = Terminal(quiet)
-    jobs = Jobs(total, terminal)
-    if not cfg:
-        terminal.line(f"simpel sweep · {total} jobs", style="bold")
-    try:
-        launch("sweep", jobs.run, overrides, config_dir=config_dir, flags=["--cfg", cfg] if cfg else ["-m"])
-    finally:
-        jobs.close()
-        if jobs.outcomes:
-            _collect(jobs.outcomes, terminal)
-    failed = [o for o in jobs.outcomes if o.code]
+    if cfg:
+        launch(_root_of(verb), perform, overrides, config_dir=config_dir, flags=["--cfg", cfg])
+        return
+    given = value_of("hydra.sweep.dir", overrides)
+    if given is not None and (Path(given) / RECORD).exists():
+        raise ConfigError(
+            f"hydra.sweep.dir: {given} holds a sweep already. Go on with `simpel sweep --resume {given}`, or choose another "
+            "directory; nothing was changed."
+        )
+    folder = str(config_dir.absolute()) if config_dir is not None else None
+    _run(Record(verb, overrides, folder, count_jobs(overrides)), overrides)
+
+
+def resume(root: Path, overrides: list[str]) -> None:
+    """Run what is missing or failed of a sweep; what is done is left as it is.
+
+    Args:
+        root: directory of the sweep.
+        overrides: of the launcher; everything else is known.
+
+    Raises:
+        ConfigError: not a sweep, or overrides of something else.
+    """
+    record = read_record(root)
+    for word in overrides:
+        if not word.startswith(("hydra.launcher.", "hydra/launcher=", "run.quiet=")):
+            raise ConfigError(
+                f"--resume: {word} is not of the launcher; the jobs are those of {root / RECORD}. For others start a new sweep."
+            )
+    keys = {word.partition("=")[0] for word in [*overrides, "hydra.sweep.dir="]}
+    kept = [word for word in record.words if word.partition("=")[0] not in keys]
+    _run(record, [*kept, *overrides, f"hydra.sweep.dir='{root.absolute()}'"])
+
+
+def _run(record: Record, words: list[str]) -> None:
+    terminal = Terminal((value_of("run.quiet", words) or "").lower() == "true")
+    terminal.line(f"simpel sweep · {record.verb} · {record.jobs} {'job' if record.jobs == 1 else 'jobs'}", style="bold")
+    folder = Path(record.config_dir) if record.config_dir else None
+    ours = (value_of("hydra/launcher", words) or NAME) == NAME
+    with interruption() as stop:
+        own = Sweep(record, terminal, stop)
+        try:
+            # another launcher may carry the task to another process: a plain function, without what holds workers
+            launch(_root_of(record.verb), own.add if ours else perform, words, config_dir=folder, flags=["-m"])
+            own.wait()
+        finally:
+            own.close()
+            root = own.root if ours else sweep_directory()
+            if root is not None and (own.outcomes or not ours):
+                if not ours:
+                    write_record(root, record)
+                collect(root, record.words, terminal)
+    _refuse_failed(own.outcomes)
+
+
+def _refuse_failed(outcomes: list[Outcome]) -> None:
+    failed = [o for o in outcomes if o.code]
     if failed:
         names = "; ".join(f"{o.directory.name}: {o.error}" for o in failed[:5])
-        error = SimpelError(f"{len(failed)} of {len(jobs.outcomes)} jobs failed, the others are collected. {names}")
+        error = SimpelError(f"{len(failed)} of {len(outcomes)} jobs failed, the others are collected. {names}")
         error.exit_code = failed[0].code
         raise error
 
 
-@contextlib.contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Take no notice of Ctrl-C within."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _root_of(verb: str) -> str:
+    """Return the name of the root configuration of a sweep of a verb."""
+    return "sweep" if verb == "fit" else verb
+
+
+def _progress(job: Job) -> str:
+    """Return how far a job is, by its metrics: they are written as it goes."""
+    path = job.directory / "metrics.jsonl"
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - 4096))
+            last = file.read().splitlines()[-2:]
+    except (OSError, IndexError):
+        return ""
+    import json
 
-
-def _begin() -> None:
-    """Prepare the worker process: it stops with its parent, however that ends."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os.kill(os.getpid(), signal.SIGTERM)  # amid a job: its state is saved first
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _leave_orphaned() -> None:
-    """End this process if nobody is left to give it jobs: it would wait for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None and not parent.is_alive():
-        os._exit(Interrupted.exit_code)
-
-
-def _work(job: Job) -> Outcome:
-    """Fit in the worker process."""
-    from simpel_cli.commands.fit import fit
-    from simpel_cli.loop import interruption
-
-    try:
-        # Ctrl-C reaches this process too; an exception raised anywhere might be lost in a callback of a library
-        with interruption():
-            fit(job)
-    except SimpelError as error:
-        return Outcome(job.directory, error.exit_code, str(error))
-    except Exception:  # whatever it is, it costs this job and no other; the traceback is kept beside it
-        text = traceback.format_exc()
-        job.directory.mkdir(parents=True, exist_ok=True)
-        (job.directory / "traceback.txt").write_text(text)
-        return Outcome(job.directory, 1, f"{text.splitlines()[-1]} (see traceback.txt in its directory)")
-    finally:
-        _leave_orphaned()
-    return Outcome(job.directory, 0, "")
-
-
-def _collect(outcomes: list[Outcome], terminal: Terminal) -> None:
-    """Write `sweep.parquet` of the finished jobs and draw the figure."""
-    root = outcomes[0].directory.parent
-    rows: list[dict[str, Any]] = []
-    for outcome in outcomes:
-        with contextlib.suppress(SimpelError):
-            if read_manifest(outcome.directory)["status"] == "done":
-                found = read_metrics(outcome.directory / "metrics.parquet")
-                name = outcome.words or outcome.directory.name
-                rows += [row | {"run": name} for row in found if row["split"] == "test"]
-    if not rows:
-        return
-    path = write_metrics(root / "sweep.parquet", rows, {})
-    terminal.line()
-    terminal.line(str(path), "results")
-    figure = draw_sweep(path)
-    if figure is not None:
-        terminal.line(str(figure), "figure")
-
-
-def _result(directory: Path) -> str:
-    """Joint test NLL and error of a finished job; the error has no unit, since a joint one may have several."""
-    rows = read_metrics(directory / "metrics.parquet")
-    shown = []
-    for metric, name in (("nll", "NLL"), ("nrmse", "normalised RMSE")):
-        values = [r["value"] for r in rows if r["metric"] == metric and r["output"] == "joint"]
-        shown.append(f"{name} {sum(values) / len(values):.3g}")
-    return "  ".join(shown)
+    for line in reversed(last):
+        with contextlib.suppress(ValueError):
+            return f"step {json.loads(line)['step']}"
+    return ""

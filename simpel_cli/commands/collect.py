@@ -1,0 +1,128 @@
+"""What a sweep has come to: its record, its jobs by directory, one table of their test metrics, the figure."""
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from simpel_cli.config import swept_keys
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError, SimpelError
+from simpel_cli.plots import draw_sweep
+from simpel_cli.records import read_metrics, write_metrics, write_text
+from simpel_cli.run import read_manifest
+
+RECORD = "sweep.json"
+HEADLINES = {  # metric -> what it is called in a line
+    "nll": "NLL", "nrmse": "normalised RMSE", "return_in_truth": "return", "return": "return", "success": "success",
+}  # fmt: skip
+
+
+class Record(NamedTuple):
+    """What was asked of a sweep: enough to ask it again.
+
+    Args:
+        verb: of its jobs.
+        words: overrides, as typed.
+        config_dir: folder of the user's groups.
+        jobs: how many.
+    """
+
+    verb: str
+    words: list[str]
+    config_dir: str | None
+    jobs: int
+
+
+class Found(NamedTuple):
+    """A job of a sweep, as its directory tells."""
+
+    directory: Path
+    words: str
+    status: str  # done, failed, interrupted, running, or "" where nothing was begun
+
+
+def write_record(root: Path, record: Record) -> None:
+    """Write the record of a sweep into its directory."""
+    write_text(root / RECORD, json.dumps(record._asdict(), indent=1))
+
+
+def read_record(root: Path) -> Record:
+    """Read the record of a sweep.
+
+    Raises:
+        ConfigError: there is none, or it is not readable.
+    """
+    path = root / RECORD
+    try:
+        found = json.loads(path.read_text())
+        record = Record(**found)
+        if not isinstance(record.words, list) or not isinstance(record.jobs, int):
+            raise TypeError("not a record of a sweep")
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{root}: not the directory of a sweep (it has no {RECORD}). They lie under runs/sweep."
+        ) from error
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"{path}: not readable ({error}).") from error
+    return record
+
+
+def jobs_of(root: Path, words: list[str]) -> Iterator[Found]:
+    """Give the jobs below the directory of a sweep with these overrides."""
+    import yaml
+
+    swept = swept_keys(words)
+    for path in sorted(root.glob("**/.hydra/overrides.yaml"), key=_in_order):
+        directory = path.parents[1]
+        if ".failed-" in directory.name:
+            continue
+        with contextlib.suppress(OSError, yaml.YAMLError):
+            own = [str(word).removeprefix("++") for word in yaml.safe_load(path.read_text()) or []]
+            status = ""
+            with contextlib.suppress(SimpelError):
+                status = str(read_manifest(directory).get("status"))
+            yield Found(directory, " ".join(w for w in own if w.partition("=")[0] in swept), status)
+
+
+def collect(root: Path, words: list[str], terminal: Terminal) -> None:
+    """Write `sweep.parquet` of the jobs that are done, and draw the figure; name those that are not."""
+    found = list(jobs_of(root, words))
+    rows: list[dict[str, Any]] = []
+    for job in found:
+        if job.status == "done":
+            with contextlib.suppress(SimpelError, OSError):
+                own = read_metrics(job.directory / "metrics.parquet")
+                rows += [row | {"run": job.words or job.directory.name} for row in own if row["split"] == "test"]
+    left = [job.directory.name for job in found if job.status != "done"]
+    if left:
+        shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
+        terminal.line(f"not done: {shown}; `simpel sweep --resume {root}` runs them")
+    if not rows:
+        return
+    path = write_metrics(root / "sweep.parquet", rows, {})
+    terminal.line()
+    terminal.line(str(path), "results")
+    figure = draw_sweep(path)
+    if figure is not None:
+        terminal.line(str(figure), "figure")
+
+
+def headline(directory: Path) -> str:
+    """Return what a finished job came to, in a few words."""
+    verdict = directory / "verdict.json"
+    if verdict.exists():
+        return str(json.loads(verdict.read_text()).get("verdict", ""))
+    rows = [r for r in read_metrics(directory / "metrics.parquet") if r["split"] == "test"]
+    shown = []
+    for metric, name in HEADLINES.items():
+        values = [r["value"] for r in rows if r["metric"] == metric and r["output"] in ("joint", "")]
+        if values:  # a joint error has no unit, since it may be of several
+            shown.append(f"{name} {sum(values) / len(values):.3g}")
+    return "  ".join(shown)
+
+
+def _in_order(path: Path) -> tuple[Any, ...]:
+    name = path.parents[1].name
+    return (0, int(name), "") if name.isdigit() else (1, 0, str(path))
