@@ -23,9 +23,10 @@ help: ## Show this list
 
 install: $(STAMP) ## Set up .venv from the lock (brings uv along if it is not there)
 
+# bytecode: where Python may not write it, every start of `simpel` compiled what it imports (4.5 s instead of 1.6 s)
 $(STAMP): pyproject.toml uv.lock
 	@command -v $(UV) >/dev/null || { $(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet uv; }
-	UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never $(UV) sync --frozen --quiet --python $(PYTHON)
+	UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never $(UV) sync --frozen --quiet --compile-bytecode --python $(PYTHON)
 	@touch $@
 
 demo: install ## Run the main job (simpel fit experiment=pendulum) and say where the report lies
