@@ -219,6 +219,25 @@ def sweep(
 
 
 @app.command()
+def report(
+    directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Runs, sweeps, or folders of them.")],
+    out: Annotated[Path | None, typer.Option(help="Folder of the report.")] = None,
+    baseline: Annotated[str | None, typer.Option(help="Method that the others are compared with.")] = None,
+) -> None:
+    """Compare runs and sweeps: one HTML file, LaTeX and CSV tables.
+
+    Examples:
+      simpel report runs/sweep/pendulum/20261121-101502-3fa9
+
+      simpel report runs/fit/pendulum/* --baseline fsvgd --out comparison
+    """
+    from simpel_cli.commands.report import default_folder
+    from simpel_cli.commands.report import report as task
+
+    task(directories, out or default_folder(directories), baseline)
+
+
+@app.command()
 def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
     """Turn a simulator or a MuJoCo world into measurements: Parquet and card.
 

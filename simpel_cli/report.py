@@ -45,7 +45,8 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } summary {
  src="data:image/{{ section.image }}">{% endif %}
 {% if section.after %}<p>{{ section.after }}</p>{% endif %}{% endfor %}
 <h2>Go on</h2><pre>{{ commands }}</pre>
-<h2>Configuration</h2><details><summary>Every key, as resolved</summary><pre>{{ config }}</pre></details>
+{% if config %}<h2>Configuration</h2>
+<details><summary>Every key, as resolved</summary><pre>{{ config }}</pre></details>{% endif %}
 </body></html>
 """
 
@@ -148,7 +149,7 @@ def write_report(
     lead: str,
     sections: list[dict[str, Any]],
     commands: list[str],
-    config: str,
+    config: str = "",
     opening: str = "",
 ) -> Path:
     """Write the report.
@@ -161,7 +162,7 @@ def write_report(
             they are, escaped; `equations`, `[{title, lines}]` with a line a list of (text, whether it is new); a figure,
             see `figure`; and a paragraph `after`.
         commands: what to type next.
-        config: the resolved configuration.
+        config: the resolved configuration; empty: there is none.
         opening: a sentence that says it all, in front of the lead.
     """
     from jinja2 import Environment

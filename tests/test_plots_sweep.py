@@ -43,8 +43,8 @@ def test_a_line_far_off_is_noted_with_its_median(tmp_path: Path, monkeypatch: py
     nrmse = {"simpel": (0.06, 0.05), "simpel_only_sim": (0.07, 0.06), "fsvgd": (0.4, 0.2)}
     rows = [
         {
-            "run": f"method={method} data.n_train={n}", "experiment": "e", "data": "d", "method": method, "n_train": n,
-            "seed": seed, "step": 1, "split": "test", "metric": metric, "output": "joint", "unit": "1",
+            "run": f"method={method} data.n_train={n}", "command": "fit", "experiment": "e", "data": "d", "method": method,
+            "n_train": n, "seed": seed, "step": 1, "split": "test", "metric": metric, "output": "joint", "unit": "1",
             "value": table[method][i] * (1 + 0.01 * seed),
         }
         for metric, table in (("nll", nll), ("nrmse", nrmse))

@@ -1,17 +1,16 @@
-"""What a sweep has come to: its record, its jobs by directory, one table of their test metrics, the figure."""
+"""What a sweep has come to: its record, one table of the test metrics of its jobs, the figure."""
 
 import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from simpel_cli.commands.gather import runs_below
 from simpel_cli.config import swept_keys
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.plots import draw_sweep
 from simpel_cli.records import read_metrics, write_metrics, write_text
-from simpel_cli.run import read_manifest
 
 RECORD = "sweep.json"
 HEADLINES = {  # metric -> what it is called in a line
@@ -33,14 +32,6 @@ class Record(NamedTuple):
     words: list[str]
     config_dir: str | None
     jobs: int
-
-
-class Found(NamedTuple):
-    """A job of a sweep, as its directory tells."""
-
-    directory: Path
-    words: str
-    status: str  # done, failed, interrupted, running, or "" where nothing was begun
 
 
 def write_record(root: Path, record: Record) -> None:
@@ -69,32 +60,17 @@ def read_record(root: Path) -> Record:
     return record
 
 
-def jobs_of(root: Path, words: list[str]) -> Iterator[Found]:
-    """Give the jobs below the directory of a sweep with these overrides."""
-    import yaml
-
-    swept = swept_keys(words)
-    for path in sorted(root.glob("**/.hydra/overrides.yaml"), key=_in_order):
-        directory = path.parents[1]
-        if ".failed-" in directory.name:
-            continue
-        with contextlib.suppress(OSError, yaml.YAMLError):
-            own = [str(word).removeprefix("++") for word in yaml.safe_load(path.read_text()) or []]
-            status = ""
-            with contextlib.suppress(SimpelError):
-                status = str(read_manifest(directory).get("status"))
-            yield Found(directory, " ".join(w for w in own if w.partition("=")[0] in swept), status)
-
-
 def collect(root: Path, words: list[str], terminal: Terminal) -> None:
     """Write `sweep.parquet` of the jobs that are done, and draw the figure; name those that are not."""
-    found = list(jobs_of(root, words))
+    swept = swept_keys(words)
+    found = list(runs_below(root))
     rows: list[dict[str, Any]] = []
     for job in found:
         if job.status == "done":
+            own = " ".join(word for word in job.words if word.partition("=")[0] in swept)
             with contextlib.suppress(SimpelError, OSError):
-                own = read_metrics(job.directory / "metrics.parquet")
-                rows += [row | {"run": job.words or job.directory.name} for row in own if row["split"] == "test"]
+                metrics = read_metrics(job.directory / "metrics.parquet")
+                rows += [row | {"run": own or job.directory.name} for row in metrics if row["split"] == "test"]
     left = [job.directory.name for job in found if job.status != "done"]
     if left:
         shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
@@ -107,6 +83,7 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> None:
     figure = draw_sweep(path)
     if figure is not None:
         terminal.line(str(figure), "figure")
+    terminal.line(f"simpel report {root}", "next")
 
 
 def headline(directory: Path) -> str:
@@ -121,8 +98,3 @@ def headline(directory: Path) -> str:
         if values:  # a joint error has no unit, since it may be of several
             shown.append(f"{name} {sum(values) / len(values):.3g}")
     return "  ".join(shown)
-
-
-def _in_order(path: Path) -> tuple[Any, ...]:
-    name = path.parents[1].name
-    return (0, int(name), "") if name.isdigit() else (1, 0, str(path))

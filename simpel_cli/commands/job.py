@@ -9,6 +9,7 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
+from simpel_cli.commands.gather import ASIDE
 from simpel_cli.config import Job, load
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.interruption import interruption, stop_if
@@ -99,7 +100,7 @@ def _begun(job: Job) -> bool:
 def _set_aside(directory: Path) -> None:
     """Move what a failed job left, but for Hydra's record of this one."""
     number = 1
-    while (aside := directory.with_name(f"{directory.name}.failed-{number}")).exists():
+    while (aside := directory.with_name(f"{directory.name}{ASIDE}{number}")).exists():
         number += 1
     aside.mkdir()
     for path in list(directory.iterdir()):

@@ -1,14 +1,15 @@
 """The figure of a sweep: test NLL and error against the number of training transitions."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from simpel_cli.evaluation.comparison import METRICS, Point, by_seed, points
 from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, ratio_scale, save
 from simpel_cli.records import read_metrics
 
-METRICS = {"nll": "test NLL [nat]", "nrmse": "test RMSE, normalised"}
 FARTHEST = 5.0  # a line that would stretch the axis more than so many times is not followed
 LEAST_SPAN = 1.0  # nat; differences below are small however the lines lie
 
@@ -24,54 +25,65 @@ class Line(NamedTuple):
 
 
 def draw_sweep(path: Path) -> Path | None:
-    """Draw joint test NLL and normalised RMSE against the number of training transitions, from `sweep.parquet`.
+    """Draw the metrics of `sweep.parquet` against the number of training transitions, see `draw_by_size`."""
+    rows = read_metrics(path)
+    every = [point for run in distinct(r["run"] for r in rows) for point in _points(rows, run)]
+    return draw_by_size(every, path.with_name("metrics_vs_n_train.png"))
+
+
+def draw_by_size(every: Sequence[Point], path: Path) -> Path | None:
+    """Draw joint metrics against the number of training transitions.
 
     A line per method and further swept key (median over seeds), a band from the smallest to the largest seed, a row
     of two panels per data set. A line far above all others in NLL leaves the panel, with its values noted at the edge:
     following it would flatten the others into one.
     Returns None where no run has a metric.
     """
-    rows = [r for r in read_metrics(path) if r["split"] == "test" and r["output"] == "joint" and r["metric"] in METRICS]
-    if not rows:
+    shown = []
+    for panel in distinct(p.panel for p in every):
+        own = [p for p in every if p.panel == panel]
+        there = [m for m in METRICS.get(panel[0], ()) if m.sign and any(p.metric == m.name for p in own)]
+        shown += [(panel, metric, by_seed(own, metric.name)) for metric in there[:2]]
+    if not shown:
         return None
-    data_sets = distinct((r["experiment"], r["data"]) for r in rows)
-    figure, axes = new_figure(2 * len(data_sets), 4.2, 3.2, columns=2)
-    panels = [(data_set, metric) for data_set in data_sets for metric in METRICS]
-    for axis, (data_set, metric) in zip(axes, panels, strict=True):
-        own = [r for r in rows if (r["experiment"], r["data"]) == data_set and r["metric"] == metric]
-        lines = _lines(own)
-        for j, line in enumerate(lines):
-            style = line_style(j)
+    figure, axes = new_figure(len(shown), 4.2, 3.2, columns=2)
+    names = distinct(name for *_, cells in shown for name, _ in cells)
+    for axis, (panel, metric, cells) in zip(axes, shown, strict=True):
+        lines = _lines(cells)
+        for line in lines:
+            style = line_style(names.index(line.name))
             axis.fill_between(line.sizes, line.low, line.high, color=style["color"], alpha=0.2, linewidth=0)
             axis.plot(line.sizes, line.middle, label=line.name, **(style | {"marker": "o", "markevery": 1}))
-        sizes = sorted({r["n_train"] for r in own})
-        axis.set(title=data_set[0], xlabel="training transitions", ylabel=METRICS[metric], xscale="log")
+        sizes = sorted({size for _, size in cells})
+        axis.set(title=panel[1] or panel[2], xlabel="training transitions", ylabel=metric.label)
+        if min(sizes) > 0:
+            axis.set_xscale("log")
         axis.set_xticks(sizes, [str(n) for n in sizes])
         axis.minorticks_off()
         axis.margins(x=0.1)
-        (_zoom if metric == "nll" else _by_ratio)(axis, lines)
+        if metric.name == "nll":
+            _zoom(axis, lines, names)
+        elif metric.sign < 0:
+            _by_ratio(axis, lines)
     legend_below(figure, axes[0])
-    return save(figure, path.with_name("metrics_vs_n_train.png"))
+    return save(figure, path)
 
 
-def _lines(rows: list[dict[str, Any]]) -> list[Line]:
+def _points(rows: list[dict[str, Any]], run: str) -> list[Point]:
+    return points((r for r in rows if r["run"] == run), run.split())
+
+
+def _lines(cells: dict[tuple[str, int], dict[int, float]]) -> list[Line]:
     lines = []
-    for name in distinct(_name(r) for r in rows):
-        sizes = sorted({r["n_train"] for r in rows if _name(r) == name})
-        values = [[r["value"] for r in rows if _name(r) == name and r["n_train"] == n] for n in sizes]
+    for name in distinct(name for name, _ in cells):
+        sizes = sorted(size for own, size in cells if own == name)
+        values = [list(cells[name, size].values()) for size in sizes]
         spread = (np.array([reduce(v) for v in values]) for reduce in (np.min, np.median, np.max))
         lines.append(Line(name, np.array(sizes), *spread))
     return lines
 
 
-def _name(row: dict[str, Any]) -> str:
-    """Name of the line that a row of a sweep belongs to: its method, and every swept key but seed and training size."""
-    swept = [w for w in row["run"].split() if "=" in w]
-    own = [w for w in swept if not w.startswith(("method=", "data.n_train=", "run.seed="))]
-    return " ".join([row["method"], *own])
-
-
-def _zoom(axis: Any, lines: list[Line]) -> None:
+def _zoom(axis: Any, lines: list[Line], names: list[str]) -> None:
     """Fit the axis to the lines that lie together; note the medians of the others where they leave it."""
     bottom, top = view(lines)
     if top is None:
@@ -79,8 +91,8 @@ def _zoom(axis: Any, lines: list[Line]) -> None:
     axis.set_ylim(bottom, top)
     for size in distinct(n for line in lines for n in line.sizes.tolist()):
         beyond = [
-            (j, float(line.middle[line.sizes == size][0]))
-            for j, line in enumerate(lines)
+            (names.index(line.name), float(line.middle[line.sizes == size][0]))
+            for line in lines
             if size in line.sizes and line.middle[line.sizes == size][0] > top
         ]
         for place, (j, value) in enumerate(sorted(beyond, key=lambda item: -item[1])):

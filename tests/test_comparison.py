@@ -1,0 +1,121 @@
+"""Means over seeds, differences in pairs, and `simpel report` on Parquet files alone."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import simpel
+
+from simpel_cli.evaluation.comparison import Mean, best, difference, mean
+from simpel_cli.records import write_metrics, write_table
+
+SIZES, SEEDS = (10, 40), (0, 1, 2)
+LEVEL = {("simpel", 10): -8.0, ("simpel", 40): -9.0, ("fsvgd", 10): 20.0, ("fsvgd", 40): -8.9}
+NOISE = {0: 0.3, 1: -0.2, 2: -0.1}  # of a seed, the same for all methods: it cancels in pairs
+
+
+def row(metric: str, value: float, **more: object) -> dict[str, object]:
+    base = {"command": "fit", "experiment": "pend_ulum", "data": "d", "split": "test", "output": "joint", "unit": "1"}
+    return base | {"step": 9, "metric": metric, "value": value} | more
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Fits of two methods, two sizes and three seeds, of which nothing was kept but Parquet, and a run that failed."""
+    for (method, n), level in LEVEL.items():
+        for seed in SEEDS:
+            folder = tmp_path / "fits" / f"{method}-{n}-{seed}"
+            folder.mkdir(parents=True)
+            own = {"method": method, "n_train": n, "seed": seed}
+            rows = [row("nll", level + NOISE[seed] + 0.01 * seed, **own), row("coverage_90", 0.9, **own)]
+            rows += [row("loss", 5.0 / k, split="train", output="", **own | {"step": k}) for k in (1, 2, 3)]
+            write_metrics(folder / "metrics.parquet", rows, {})
+            levels = [0.5, 0.9]
+            write_table(folder / "calibration.parquet", {"output": ["joint"] * 2, "level": levels, "fraction": levels})
+    failed = tmp_path / "fits" / "broken"
+    failed.mkdir()
+    (failed / "manifest.json").write_text(json.dumps({"command": "fit", "status": "failed"}))
+    return tmp_path / "fits"
+
+
+def test_intervals_are_student_s() -> None:
+    values = np.array([1.0, 2.0, 4.0])
+    found = mean(values)
+    half = 4.302653 * values.std(ddof=1) / 3**0.5  # the 0.975 quantile with two degrees of freedom
+    np.testing.assert_allclose(found[:3], (values.mean(), values.mean() - half, values.mean() + half), rtol=1e-6)
+    assert np.isnan(mean([3.0]).low)
+    assert not mean([3.0]).certain
+    assert mean([3.0, 3.1]).certain
+
+
+def test_pairs_share_their_seeds() -> None:
+    assert difference({0: 3.0, 1: 5.0, 7: 99.0}, {0: 2.0, 1: 4.0, 8: -99.0})[:3] == (1.0, 1.0, 1.0)
+    assert np.isnan(difference({0: 1.0}, {1: 1.0}).value)
+
+
+def test_best() -> None:
+    cells = {("a", 1): {0: 1.0, 1: 2.0}, ("b", 1): {0: 2.0, 1: 3.1}, ("c", 1): {0: float("nan")}, ("b", 2): {0: 1.0}}
+    low, alone = best(cells, -1)
+    assert (low.variant, low.second, alone.variant, alone.second) == ("a", "b", "b", "")
+    assert low.lead.value == pytest.approx(1.05)
+    assert isinstance(low.lead, Mean)
+    assert low.lead.low < 1.05 < low.lead.high
+    high, _ = best(cells, 1)
+    assert (high.variant, high.lead.value) == ("b", pytest.approx(1.05))
+
+
+def test_report_of_parquet_files(runs: Path, tmp_path: Path) -> None:
+    result = simpel(tmp_path, "report", "fits")
+    assert (result.code, result.err) == (0, "")
+    # 0.1 apart in every seed: certain in pairs, though the seeds differ by 0.5
+    assert "pend_ulum: simpel has the best test NLL [nat] at n = 40, ahead of fsvgd by 0.1" in result.out
+    page = (runs / "report.html").read_text()
+    for words in ("12 finished runs of 2 methods, 3 seeds", "broken", "failed", "learning curves", "calibration"):
+        assert words in page
+    assert page.count("data:image/png") == 3
+    assert "http" not in page.replace("http://www.w3.org", "")  # self-contained
+    with (runs / "tables" / "fit-pend_ulum-nll-differences.csv").open() as file:
+        found = {int(r["n_train"]): r for r in csv.DictReader(file)}
+    assert float(found[10]["difference"]) == pytest.approx(28.0)
+    assert float(found[40]["low"]) == pytest.approx(0.1, abs=1e-6)
+    assert found[40]["baseline"] == "simpel"
+    latex = (runs / "tables" / "fit-pend_ulum-nll.tex").read_text()
+    assert r"\caption{pend\_ulum: test NLL [nat]}" in latex
+    assert latex.count(r"\\") == 3
+    # again, over itself, against the other; a sweep's table alone says the same
+    result = simpel(tmp_path, "report", "fits", "--baseline", "fsvgd", "--out", "there")
+    assert result.code == 0
+    assert "less fsvgd" in (tmp_path / "there" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("report", "nowhere"), "report: nowhere is no directory."),
+        (("report", "."), "holds no runs"),
+        (("report", "fits/broken"), "of 1 runs none is done with metrics that can be read (1 failed)"),
+        (
+            ("report", "fits", "--baseline", "simple"),
+            "--baseline: got simple, which no run is of. Did you mean simpel?",
+        ),
+        (("report", "fits", "--out", "file"), "--out: cannot write to file"),
+    ],
+)
+def test_wrong_reports(runs: Path, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "empty").mkdir()
+    result = simpel(tmp_path / "empty" if words[1] == "." else tmp_path, *words)
+    assert result.code == 2
+    assert message in result.err
+
+
+def test_a_damaged_run_costs_itself_only(runs: Path, tmp_path: Path) -> None:
+    (runs / "simpel-10-0" / "metrics.parquet").write_bytes(b"PAR1 and nothing else")
+    (runs / "simpel-10-1" / "calibration.parquet").write_bytes(b"")
+    result = simpel(tmp_path, "report", "fits")
+    assert result.code == 0
+    page = (runs / "report.html").read_text()
+    assert "done, metrics not readable" in page
+    assert "Over 2 to 3 seeds." in page
