@@ -2,6 +2,9 @@
 
 import csv
 import json
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -119,3 +122,31 @@ def test_a_damaged_run_costs_itself_only(runs: Path, tmp_path: Path) -> None:
     page = (runs / "report.html").read_text()
     assert "done, metrics not readable" in page
     assert "Over 2 to 3 seeds." in page
+
+
+LOOK = """<script>addEventListener("load", () => {
+  const images = [...document.images].filter(image => image.naturalWidth > 50).length;
+  const wide = document.documentElement.scrollWidth > innerWidth;
+  document.title = `images ${images} tables ${document.querySelectorAll("table").length} wide ${wide}`;
+});</script>"""
+
+
+def test_report_in_a_browser(runs: Path, tmp_path: Path) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    assert simpel(tmp_path, "report", "fits").code == 0
+    page = tmp_path / "page.html"
+    page.write_text((runs / "report.html").read_text().replace("</head>", LOOK + "</head>"))
+    words = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        f"--user-data-dir={tmp_path / 'chromium'}",
+        "--window-size=900,900",
+    ]
+    words += ["--disable-background-networking", "--virtual-time-budget=5000", "--dump-dom"]
+    shown = subprocess.run([browser, *words, page.as_uri()], capture_output=True, text=True, timeout=120)
+    title = re.search("<title>(.*?)</title>", shown.stdout)
+    assert title is not None, shown.stderr
+    assert title[1] == "images 3 tables 6 wide false"
