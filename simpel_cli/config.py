@@ -224,6 +224,12 @@ def load(path: Path) -> dict[str, Any]:
     return config
 
 
+def options(group: str, config_dir: Path | None = None) -> dict[str, Path]:
+    """Return the options of a group by name: simpel's own, and those of a user's folder, which go before."""
+    roots = [conf_dir(), _user_conf(config_dir)]
+    return {path.stem: path for root in roots if root is not None for path in sorted((root / group).glob("*.yaml"))}
+
+
 def dump(config: dict[str, Any]) -> str:
     """Return a resolved configuration as YAML."""
     import yaml

@@ -238,6 +238,36 @@ def report(
 
 
 @app.command()
+def sims(
+    name: Annotated[str | None, typer.Argument(help="Show one, with ranges and equations.")] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """List the simulators with their units."""
+    from simpel_cli.commands.catalogue import sims as task
+
+    task(name, config_dir)
+
+
+@app.command()
+def effects(
+    name: Annotated[str | None, typer.Argument(help="Show one, with its parameters.")] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """List the effects that `discover` can find, with their formulas."""
+    from simpel_cli.commands.catalogue import effects as task
+
+    task(name, config_dir)
+
+
+@app.command()
+def doctor() -> None:
+    """Tell what this installation has, and test in a few seconds whether it computes right."""
+    from simpel_cli.commands.doctor import doctor as task
+
+    task()
+
+
+@app.command()
 def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
     """Turn a simulator or a MuJoCo world into measurements: Parquet and card.
 

@@ -10,7 +10,7 @@ from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.prior_look import describe_prior
 from simpel_cli.commands.run_table import named_method
 from simpel_cli.commands.study import Fitted, Study
-from simpel_cli.console import Terminal
+from simpel_cli.console import Terminal, aligned
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.inference import Method
@@ -113,10 +113,10 @@ def publish(
     terminal.line()
     terminal.line(f"{f'test ({extent})':<20}{_headline(study, values)}")
     table = _table(study, values)
-    terminal.line(_aligned(table["head"], table["rows"]))
+    terminal.line(aligned(table["head"], table["rows"]))
     free = _free_run_table(study, values)
     if free is not None:
-        terminal.line(_aligned(free["head"], free["rows"]))
+        terminal.line(aligned(free["head"], free["rows"]))
     spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
     next_commands = _next(study, directory, source)
@@ -215,15 +215,6 @@ def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
         (_named(q.name, q.unit), *(_shown(values[m, q.name]) for m in metrics)) for q in study.system.encoding.states
     ]
     return {"head": ("free run, RMSE", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
-
-
-def _aligned(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """Columns of equal width, for terminals."""
-    cells = [head, *rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join(
-        "  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells
-    )
 
 
 def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
