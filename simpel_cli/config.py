@@ -227,7 +227,8 @@ def load(path: Path) -> dict[str, Any]:
 def options(group: str, config_dir: Path | None = None) -> dict[str, Path]:
     """Return the options of a group by name: simpel's own, and those of a user's folder, which go before."""
     roots = [conf_dir(), _user_conf(config_dir)]
-    return {path.stem: path for root in roots if root is not None for path in sorted((root / group).glob("*.yaml"))}
+    found = {path.stem: path for root in roots if root is not None for path in (root / group).glob("*.yaml")}
+    return dict(sorted(found.items()))
 
 
 def dump(config: dict[str, Any]) -> str:
@@ -297,11 +298,29 @@ def _top_level(verb: str) -> list[str]:
     return [*(name for name in _entries(verb) if name != "experiment"), *brought]
 
 
-def _entries(verb: str) -> list[str]:
+def defaults_of(verb: str) -> dict[str, Any]:
+    """Return the groups of a root configuration, and of those that it builds on, with the options that they begin with.
+
+    A key that is no group, and a group that an experiment brings, has None.
+    """
     import yaml
 
     root = yaml.safe_load((conf_dir() / f"{verb}.yaml").read_text())
     entries = root.get("defaults", [])
-    inherited = [name for e in entries if isinstance(e, str) and e != "_self_" for name in _entries(e)]
-    groups = [name for name in (next(iter(d)) for d in entries if isinstance(d, dict)) if "/" not in name]
-    return list(dict.fromkeys([*inherited, *groups, *(k for k in root if k not in ("defaults", "hydra"))]))
+    found: dict[str, Any] = {}
+    for inherited in (e for e in entries if isinstance(e, str) and e != "_self_"):
+        found |= defaults_of(inherited)
+    for name, option in ((n, o) for e in entries if isinstance(e, dict) for n, o in e.items()):
+        plain = name.removeprefix("override ")
+        if "/" not in plain:
+            found[plain] = option
+    return found | {key: None for key in root if key not in ("defaults", "hydra")}
+
+
+def group_of(key: str) -> str:
+    """Return the group of a key such as `sim@truth`, or of the name that such a group is brought under."""
+    return next((group for group, name in BROUGHT.items() if name == key), key).partition("@")[0]
+
+
+def _entries(verb: str) -> list[str]:
+    return list(defaults_of(verb))

@@ -43,8 +43,24 @@ def _simpel(
     """Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems."""
 
 
+def _completed(context: typer.Context, parameter: object, incomplete: str) -> list[str]:
+    from simpel_cli.completion import overrides
+
+    return overrides(context, parameter, incomplete)
+
+
+def _option_of(group: str) -> Callable[[typer.Context, object, str], list[str]]:
+    def complete(context: typer.Context, parameter: object, incomplete: str) -> list[str]:
+        from simpel_cli.config import options
+
+        return [name for name in options(group, context.params.get("config_dir")) if name.startswith(incomplete)]
+
+    return complete
+
+
 Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.")
+    list[str] | None,
+    typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.", shell_complete=_completed),
 ]
 ConfigDir = Annotated[
     Path | None,
@@ -239,7 +255,9 @@ def report(
 
 @app.command()
 def sims(
-    name: Annotated[str | None, typer.Argument(help="Show one, with ranges and equations.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Show one, with ranges and equations.", shell_complete=_option_of("sim"))
+    ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
     """List the simulators with their units."""
@@ -250,7 +268,9 @@ def sims(
 
 @app.command()
 def effects(
-    name: Annotated[str | None, typer.Argument(help="Show one, with its parameters.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Show one, with its parameters.", shell_complete=_option_of("effect"))
+    ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
     """List the effects that `discover` can find, with their formulas."""
