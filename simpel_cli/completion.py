@@ -10,12 +10,11 @@ from simpel_cli.config import BROUGHT, CONTROL, defaults_of, group_of, load, opt
 from simpel_cli.errors import SimpelError
 
 
-def overrides(context: Any, parameter: Any, incomplete: str) -> list[str]:
+def overrides(context: Any, incomplete: str) -> list[str]:
     """Return completions of an override, as Typer asks for them.
 
     Args:
         context: of the command; its name is the verb.
-        parameter: that is completed.
         incomplete: what stands before the cursor. Bash takes words apart at `=`, zsh and fish do not.
     """
     before = re.sub(r" =( |$)", "=", " ".join(map(str, context.params.get("overrides") or []))).split()

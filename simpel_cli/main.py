@@ -43,14 +43,14 @@ def _simpel(
     """Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems."""
 
 
-def _completed(context: typer.Context, parameter: object, incomplete: str) -> list[str]:
+def _completed(context: typer.Context, incomplete: str) -> list[str]:
     from simpel_cli.completion import overrides
 
-    return overrides(context, parameter, incomplete)
+    return overrides(context, incomplete)
 
 
-def _option_of(group: str) -> Callable[[typer.Context, object, str], list[str]]:
-    def complete(context: typer.Context, parameter: object, incomplete: str) -> list[str]:
+def _option_of(group: str) -> Callable[[typer.Context, str], list[str]]:
+    def complete(context: typer.Context, incomplete: str) -> list[str]:
         from simpel_cli.config import options
 
         return [name for name in options(group, context.params.get("config_dir")) if name.startswith(incomplete)]
@@ -60,7 +60,7 @@ def _option_of(group: str) -> Callable[[typer.Context, object, str], list[str]]:
 
 Overrides = Annotated[
     list[str] | None,
-    typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.", shell_complete=_completed),
+    typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.", autocompletion=_completed),
 ]
 ConfigDir = Annotated[
     Path | None,
@@ -254,9 +254,27 @@ def report(
 
 
 @app.command()
+def export(
+    run_dir: Annotated[Path, typer.Argument(help="Directory of a fit, a discovery or an offline policy.")],
+    out: Annotated[Path | None, typer.Option(help="Folder of the files; left out: export/ in the run's own.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of several that the run has fitted.")] = None,
+) -> None:
+    """Write the simulator for CasADi and C, and the networks for numpy.
+
+    Examples:
+      simpel export runs/discover/hidden_pendulum/20261121-101502-3fa9
+
+      simpel export runs/fit/pendulum/20261121-101502-3fa9 --out rig/model
+    """
+    from simpel_cli.commands.export import export as task
+
+    task(run_dir, out, seed)
+
+
+@app.command()
 def sims(
     name: Annotated[
-        str | None, typer.Argument(help="Show one, with ranges and equations.", shell_complete=_option_of("sim"))
+        str | None, typer.Argument(help="Show one, with ranges and equations.", autocompletion=_option_of("sim"))
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -269,7 +287,7 @@ def sims(
 @app.command()
 def effects(
     name: Annotated[
-        str | None, typer.Argument(help="Show one, with its parameters.", shell_complete=_option_of("effect"))
+        str | None, typer.Argument(help="Show one, with its parameters.", autocompletion=_option_of("effect"))
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:

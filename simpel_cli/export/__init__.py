@@ -1,0 +1,1 @@
+"""What a run learned, as files that need no simpel: networks for numpy, simulators for CasADi and C."""
