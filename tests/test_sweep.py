@@ -143,6 +143,7 @@ def test_another_launcher_of_hydra_runs_the_same_jobs(tmp_path: Path) -> None:
     words = ["experiment=pendulum", *TINY, "run.quiet=false", "hydra.sweep.dir=sweep", "method.learning_rate=0.001,-1"]
     result = simpel(tmp_path, "sweep", *words, "hydra/launcher=basic")
     assert "not done: 1; `simpel sweep --resume" in result.out
+    assert (result.code, "1 of 2 jobs are not done" in result.err) == (1, True)
     assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]
     table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
     assert {row["run"] for row in table} == {"method.learning_rate=0.001"}

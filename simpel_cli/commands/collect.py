@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.commands.gather import runs_below
+from simpel_cli.commands.gather import Found, runs_below
 from simpel_cli.config import swept_keys
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, SimpelError
@@ -60,8 +60,8 @@ def read_record(root: Path) -> Record:
     return record
 
 
-def collect(root: Path, words: list[str], terminal: Terminal) -> None:
-    """Write `sweep.parquet` of the jobs that are done, and draw the figure; name those that are not."""
+def collect(root: Path, words: list[str], terminal: Terminal) -> list[Found]:
+    """Write `sweep.parquet` of the jobs that are done, draw the figure, and name and return the jobs that are not."""
     swept = swept_keys(words)
     found = list(runs_below(root))
     rows: list[dict[str, Any]] = []
@@ -71,12 +71,13 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> None:
             with contextlib.suppress(SimpelError, OSError):
                 metrics = read_metrics(job.directory / "metrics.parquet")
                 rows += [row | {"run": own or job.directory.name} for row in metrics if row["split"] == "test"]
-    left = [job.directory.name for job in found if job.status != "done"]
+    left = [job for job in found if job.status != "done"]
     if left:
-        shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
+        shown = ", ".join(job.directory.name for job in left[:10])
+        shown += f" and {len(left) - 10} more" if len(left) > 10 else ""
         terminal.line(f"not done: {shown}; `simpel sweep --resume {root}` runs them")
     if not rows:
-        return
+        return left
     path = write_metrics(root / "sweep.parquet", rows, {})
     terminal.line()
     terminal.line(str(path), "results")
@@ -84,6 +85,7 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> None:
     if figure is not None:
         terminal.line(str(figure), "figure")
     terminal.line(f"simpel report {root}", "next")
+    return left
 
 
 def headline(directory: Path) -> str:

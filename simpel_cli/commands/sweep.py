@@ -11,6 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
+from simpel_cli.commands.gather import Found
 from simpel_cli.commands.job import Outcome, perform
 from simpel_cli.config import Job, count_jobs, launch, sweep_directory, value_of
 from simpel_cli.console import Board, Terminal
@@ -180,6 +181,7 @@ def _run(record: Record, words: list[str]) -> None:
     terminal.line(f"simpel sweep · {record.verb} · {record.jobs} {'job' if record.jobs == 1 else 'jobs'}", style="bold")
     folder = Path(record.config_dir) if record.config_dir else None
     ours = (value_of("hydra/launcher", words) or NAME) == NAME
+    left: list[Found] = []
     with interruption() as stop:
         own = Sweep(record, terminal, stop)
         try:
@@ -192,8 +194,10 @@ def _run(record: Record, words: list[str]) -> None:
             if root is not None and (own.outcomes or not ours):
                 if not ours:
                     write_record(root, record)
-                collect(root, record.words, terminal)
+                left = collect(root, record.words, terminal)
     _refuse_failed(own.outcomes)
+    if left:  # where another launcher ran them, nothing else tells
+        raise SimpelError(f"{len(left)} of {record.jobs} jobs are not done, the others are collected.")
 
 
 def _refuse_failed(outcomes: list[Outcome]) -> None:
