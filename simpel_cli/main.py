@@ -195,12 +195,14 @@ def rl_online(
       simpel rl-online experiment=rc_car_parking online.episodes=10
 
       simpel rl-online --config-dir my sim=rig reward=my_task world=folder:exchange
+
+      simpel rl-online --resume runs/rl-online/rig/20261121-101502-3fa9 online.episodes=20
     """
     if resume is not None:
-        _refuse_more(resume, overrides, config_dir, cfg, multirun)
+        _refuse_more(resume, config_dir, cfg, multirun)
         from simpel_cli.commands.rl_online import resume as go_on
 
-        go_on(resume)
+        go_on(resume, overrides or [])
     else:
         from simpel_cli.commands.rl_online import rl_online as task
 

@@ -167,6 +167,7 @@ class Manifest:
             "platform": platform.platform(),
             "versions": versions(),
             "inputs_sha256": self.inputs,
+            "config_sha256": _sha256_of_config(self.directory),
             **self.facts,
         }
         write_text(self.directory / "manifest.json", json.dumps(record, indent=1, default=str))
@@ -249,6 +250,25 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or "command" not in record:
         raise ConfigError(f"{path}: not a manifest of simpel (no key `command`).")
     return record
+
+
+def refuse_changed_config(directory: Path, record: dict[str, Any]) -> None:
+    """Refuse to go on with a run whose configuration is not the one that it was begun with: cut off, or edited.
+
+    Raises:
+        ConfigError: it is another one.
+    """
+    kept = record.get("config_sha256")
+    if kept is not None and kept != _sha256_of_config(directory):
+        raise ConfigError(
+            f"{directory / 'config.yaml'}: not as it was when the run began (damaged, or edited). Restore it; for other "
+            "settings start a new run."
+        )
+
+
+def _sha256_of_config(directory: Path) -> str | None:
+    path = directory / "config.yaml"
+    return sha256(path) if path.is_file() else None
 
 
 def refuse_occupied(directory: Path, key: str = "hydra.run.dir") -> None:

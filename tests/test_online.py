@@ -2,10 +2,12 @@
 
 import json
 import shutil
+import subprocess
 import sys
 import threading
 import time
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
 from simpel_cli.records import read_metrics, write_table
+from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import contract, load_policy, save_policy
 from simpel_cli.rl.plant import Ride, Simulated, Stepped, earned, write_ride
@@ -229,8 +232,8 @@ def anything(number: int, ride: Ride) -> None:
 def exchange_of(
     folder: Path, encoding: Encoding, task: Task, wait: float, run: str, said: list[str], accept: Any = anything
 ) -> Exchange:
-    goal = task.bind(encoding)
-    return Exchange(folder, encoding, goal, HORIZON, 0.05, wait, run, accept, said.append, lambda: None)
+    answers = Answers(encoding, task.bind(encoding), replace(task, horizon=HORIZON), 0.05, said.append)
+    return Exchange(folder, answers, wait, run, accept, said.append, lambda: None)
 
 
 def answer_of(folder: Path, rows: int, angle: str = "phi", speed: str = "omega") -> dict[str, Any]:
@@ -272,6 +275,7 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
             "the column omega is missing": {k: v for k, v in good.items() if k != "omega"},
             "1 rows": {k: v[:1] for k, v in good.items()},
             "t is 0.1 s": good | {"t": 0.1 * np.arange(HORIZON + 1)},
+            "far outside its range [-5, 5]": good | {"omega": good["omega"] + 1e4 * (np.arange(HORIZON + 1) == 3)},
             "a fit": good,
         }
         for i, columns in enumerate(wrong.values(), 1):
@@ -286,19 +290,20 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     ride = exchange.ride(2, tmp_path / "policy")
     thread.join()
     assert ride.states.shape == (HORIZON + 1, 2)
-    problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 7)]
+    problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 8)]
     expected = (
         "row 5: phi is nan",
         "row 0: u is 1e+09",
         "the column omega is missing",
         "1 rows",
         "row 1: t is 0.1",
+        "far outside its range [-5, 5]",
         "a fit",
     )
     for problem, words in zip(problems, expected, strict=True):
         assert words in problem
     assert refused == [2]
-    assert len(list(folder.glob("*.refused-*.parquet"))) == 6
+    assert len(list(folder.glob("*.refused-*.parquet"))) == 7
     assert "waiting for" in said[0]
     np.testing.assert_allclose(exchange.ride(2, tmp_path / "policy").states, ride.states)  # still there: taken again
     other = exchange_of(folder, encoding, task, 60.0, "another", said)
@@ -321,6 +326,71 @@ SMALL = (
     "policy.steps=4000", "policy.environments=8", "policy.looks=3", "policy.hidden=[16]",
     "control.episodes=4", "control.fine_tune=0", "reward.horizon=12", "reward.settled=5", "online.episodes=3",
 )  # fmt: skip
+
+
+def test_what_is_odd_about_an_answer_is_said(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    """It is taken all the same: a rig may have its reasons."""
+    _, encoding, task = swing
+    policy_in(tmp_path / "policy", encoding, task, 0)
+    said: list[str] = []
+    folder, other = tmp_path / "rig", tmp_path / "rig" / "episode_000"
+    exchange = exchange_of(folder, encoding, task, 0.0, "mine", said)
+    with pytest.raises(DataError, match="did not come within"):
+        exchange.ride(0, tmp_path / "policy")
+    good = answer_of(other, HORIZON + 5)
+    odd = {"u": 0.9 * np.sign(good["u"] + 1e-9), "omega": good["omega"] + 20 * (np.arange(HORIZON + 5) == 4) + 0.5}
+    write_table(folder / "episode_000.parquet", good | odd)
+    ride = exchange.ride(0, tmp_path / "policy")
+    assert ride.states.shape == (HORIZON + 1, 2)
+    every = " ".join(said)
+    for words in (
+        "has 17 rows: the first 13 are taken",
+        "row 4: omega is 2",
+        "a spike of the sensor would spoil the model",
+        "begins at omega = 0.5 rad/s; the task does in",
+        "off what the policy would have given, on average: was it this policy that drove?",
+    ):
+        assert words in every
+    # a second run does not take the folder over
+    exchange.withdraw(0)
+    theirs = exchange_of(folder, encoding, task, 0.0, "theirs", said)
+    with pytest.raises(DataError, match="is of another run, which waits for"):
+        theirs.ride(0, tmp_path / "policy")
+    (other / "request.json").write_text("{}")  # somebody did
+    write_table(folder / "episode_000.parquet", good)
+    with pytest.raises(DataError, match="this run did not ask for it"):
+        exchange.ride(0, tmp_path / "policy")
+
+
+def test_a_reward_that_is_no_number(swing: tuple[Any, Encoding, Task]) -> None:
+    _, encoding, task = swing
+    with pytest.raises(ConfigError, match=r"reward.reward: 'sqrt\(0.15 - omega\)' is nan at phi=.*, omega=.*, u="):
+        replace(task, reward="sqrt(0.15 - omega)").bind(encoding)
+    goal = replace(task, reward="sqrt(6 - omega)").bind(encoding)  # finite within the ranges
+    with pytest.raises(DataError, match=r"the reward is nan after step 1, at phi = 0, omega = 7; see reward.reward"):
+        earned(goal, encoding, np.array([[0.0, 1.0], [0.0, 7.0]]), np.zeros((2, 1)))
+
+
+def test_the_runner_goes_on_after_a_bad_line(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
+    _, encoding, task = swing
+    policy_in(tmp_path / "policy", encoding, task, 0)
+    lines = [
+        '{"phi": 3.0, "omega": 0.0}',
+        '{"phi": 3.0}',
+        "none",
+        '{"phi": NaN, "omega": 0}',
+        "[1]",
+        '{"phi": 3.0, "omega": 0.0}',
+    ]
+    words = [sys.executable, "-I", str(tmp_path / "policy" / "run_policy.py")]
+    shown = subprocess.run(words, input="\n".join(lines), capture_output=True, text=True, timeout=120)
+    answers = [json.loads(line) for line in shown.stdout.splitlines()]
+    assert (shown.returncode, shown.stderr, len(answers)) == (0, "", 6)
+    assert answers[0] == answers[5]
+    for answer in answers[1:5]:
+        assert answer["error"].startswith(
+            "needed is a JSON object with finite numbers for phi [rad], omega [rad/s]; got "
+        )
 
 
 @pytest.fixture(scope="module")
@@ -391,6 +461,47 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(driven: Path, tmp_path: P
         assert result.code == 0, result.err
         for name in ("episodes/002.parquet", "rounds/002/policy/policy.safetensors"):
             assert (run / name).read_bytes() == (driven / name).read_bytes(), name
+
+
+def test_an_episode_is_taken_back_and_more_are_driven(driven: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(driven, run)
+    (run / "episodes" / "002.parquet").unlink()  # the last one: as if a sensor had failed in it
+    result = simpel(tmp_path, "rl-online", "--resume", "run", "online.episodes=4", "run.quiet=true")
+    assert result.code == 2
+    assert "--resume: got run.quiet=true; a resumed run keeps its configuration" in result.err
+    result = simpel(tmp_path, "rl-online", "--resume", "run", "online.episodes=4")
+    assert result.code == 0, result.err
+    assert "its file was deleted" in result.out
+    for number in range(3):
+        name = f"episodes/{number:03d}.parquet"
+        assert (run / name).read_bytes() == (driven / name).read_bytes()
+    assert (run / "episodes" / "003.parquet").exists()
+    assert (run / "policy" / "policy.safetensors").read_bytes() == (
+        run / "rounds/003/policy/policy.safetensors"
+    ).read_bytes()
+    assert {r["step"] for r in read_metrics(run / "metrics.parquet")} == {0, 1, 2, 3}
+    assert "is complete; nothing to do" in simpel(tmp_path, "rl-online", "--resume", "run").out
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda run: (run / "episodes" / "001.parquet").unlink(),
+            "001.parquet is missing, but the episodes after it are there",
+        ),
+        (lambda run: (run / "rounds" / "001" / "round.json").write_text("{"), "round.json: damaged"),
+        (lambda run: (run / "config.yaml").write_text("run: {}"), "config.yaml: not as it was when the run began"),
+    ],
+)
+def test_a_run_that_was_damaged(driven: Path, tmp_path: Path, damage: Any, message: str) -> None:
+    shutil.copytree(driven, tmp_path / "run")
+    (tmp_path / "run" / "report.html").unlink()
+    damage(tmp_path / "run")
+    result = simpel(tmp_path, "rl-online", "--resume", "run")
+    assert result.code == 2
+    assert message in result.err
 
 
 @pytest.mark.parametrize(

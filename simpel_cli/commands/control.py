@@ -118,6 +118,40 @@ def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
     return Assignment(task, encoding, goal, control, policy, planner, source, truth, name)
 
 
+def task_table(asked: Assignment) -> dict[str, Any]:
+    """Return the report's table of what was asked for."""
+    task, source = asked.task, asked.source
+    begins = {q.name: task.initial.get(q.name, 0.0) for q in source.states}
+    rows = [
+        ("reward of a step", task.reward),
+        *((f"... {name}", str(text)) for name, text in task.names.items()),
+        ("horizon", f"{task.horizon} steps of {source.dt:.4g} s"),
+        ("begins at", ", ".join(f"{name} {value}" for name, value in begins.items())),
+        ("commands", ", ".join(
+            f"{q.name} {low:g} to {high:g} {q.unit}".rstrip()
+            for q, low, high in zip(asked.encoding.inputs, asked.goal.low, asked.goal.high, strict=True)
+        )),
+    ]  # fmt: skip
+    if task.success:
+        rows.append(("succeeded", f"{task.success} in each of the last {task.settled} steps"))
+    if task.stop:
+        rows.append(("ends where", task.stop))
+    return {"title": "Task", "head": (), "rows": rows, "text": True}
+
+
+def remarks(asked: Assignment) -> list[str]:
+    """Return what is odd about a task, a line each."""
+    found = []
+    for q in asked.source.states:
+        low, high = asked.task.begins(q.name)
+        if not q.periodic and (low < q.low - 0.1 * (q.high - q.low) or high > q.high + 0.1 * (q.high - q.low)):
+            found.append(
+                f"reward.initial.{q.name}: {asked.task.initial.get(q.name, 0.0)} reaches beyond its range "
+                f"[{q.low:g}, {q.high:g}] {q.unit} (sim.states.{q.name}): the model knows nothing there"
+            )
+    return found
+
+
 def _true_world(source: Any, task: Task, goal: Goal, own: Encoding, dt: float) -> World:
     if not isinstance(source, Model):
         raise ConfigError(

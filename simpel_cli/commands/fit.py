@@ -18,7 +18,7 @@ from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.records import MetricStream, write_table, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
+from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_changed_config, refuse_occupied, sha256
 
 LOG_EVERY = 50  # steps per row of the metric table
 DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
@@ -48,6 +48,7 @@ def resume(directory: Path) -> None:
     record = read_manifest(directory)
     if record["command"] != "fit":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`; only a fit can be resumed.")
+    refuse_changed_config(directory, record)
     config = load(directory / "config.yaml")
     if record.get("status") == "done":
         Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")

@@ -6,7 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.control import Assignment, Flown, assignment, judge_of, plan, refuse_outputs, train
+from simpel_cli.commands.control import (
+    Assignment,
+    Flown,
+    assignment,
+    judge_of,
+    plan,
+    refuse_outputs,
+    remarks,
+    task_table,
+    train,
+)
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump, load
@@ -19,7 +29,15 @@ from simpel_cli.records import MetricStream, load_checkpoint, write_table, write
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.files import contract, save_policy
 from simpel_cli.rl.rollout import Episodes
-from simpel_cli.run import Manifest, configure, make_directory, read_manifest, refuse_occupied, stream
+from simpel_cli.run import (
+    Manifest,
+    configure,
+    make_directory,
+    read_manifest,
+    refuse_changed_config,
+    refuse_occupied,
+    stream,
+)
 
 OWN = (
     "policy",
@@ -48,8 +66,11 @@ def resume(directory: Path) -> None:
     record = read_manifest(directory)
     if record["command"] != "rl-offline":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-offline.")
+    refuse_changed_config(directory, record)
     config = load(directory / "config.yaml")
-    if record.get("status") == "done":
+    left = [directory / "report.html", directory / "metrics.parquet"]
+    left += [] if config.get("planner") else [directory / "policy" / "policy.safetensors"]
+    if record.get("status") == "done" and all(path.exists() for path in left):
         Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
         return
     with Manifest(directory, "rl-offline", settings_of(config)) as manifest:
@@ -71,10 +92,12 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     terminal = Terminal(study.settings.quiet, directory / "run.log")
     terminal.line()
     terminal.line(_task_line(asked), "task")
+    for remark in remarks(asked):
+        terminal.line(remark, "look", style="yellow")
     constants = study.constants | {
         "run": directory.name, "command": "rl-offline", "n_train": len(model.fitted.training[0][0])
     }  # fmt: skip
-    with MetricStream(directory, constants, resume_at=_done_steps(directory)) as metrics:
+    with MetricStream(directory, constants, resume_at=done_steps(directory)) as metrics:
         if asked.planner is None:
             flown = train(model, asked, terminal, metrics, directory)
             judged = _in_truth(model, asked, flown)
@@ -103,11 +126,16 @@ def saved_policies(directory: Path, model: Learned, asked: Assignment, flown: Fl
         save_policy(folder, _of_run(flown.policies, i), facts)
 
 
-def _done_steps(directory: Path) -> int | None:
+def done_steps(directory: Path) -> int | None:
     """Return the steps of the world at the checkpoint, if there is one."""
     if not (directory / "checkpoint" / "state.safetensors").exists():
         return None
-    return int(load_checkpoint(directory / "checkpoint")[1]["world_steps"])
+    try:
+        return int(load_checkpoint(directory / "checkpoint")[1]["world_steps"])
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error} Or delete {directory / 'checkpoint'}, and the policy alone is trained anew on --resume."
+        ) from error
 
 
 def _of_run(tree: Any, i: int) -> Any:
@@ -235,6 +263,7 @@ def _publish(
         ),
         sections=[
             {"title": "Returns", "head": head, "rows": rows, "note": note},
+            task_table(asked),
             *(figure(path, f"control/{path.stem}") for path in images),
         ],
         commands=commands,

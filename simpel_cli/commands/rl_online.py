@@ -2,6 +2,7 @@
 
 import json
 import secrets
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -11,26 +12,36 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli import evaluation as ev
-from simpel_cli.commands.control import Assignment, Flown, assignment, train
+from simpel_cli.commands.control import Assignment, Flown, assignment, remarks, task_table, train
 from simpel_cli.commands.fit import Learned, learned
-from simpel_cli.commands.rl_offline import OWN, saved_policies
+from simpel_cli.commands.rl_offline import OWN, done_steps, saved_policies
 from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
 from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.data import Measurements, Recording, read, transitions
-from simpel_cli.errors import ConfigError, DataError, did_you_mean
+from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
 from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.nodes import build
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online
-from simpel_cli.records import MetricStream, load_checkpoint, write_metrics, write_text
+from simpel_cli.records import MetricStream, write_metrics, write_text
 from simpel_cli.report import figure, write_report
+from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.online import Online
 from simpel_cli.rl.plant import Plant, Ride, Simulated, Stepped, write_ride
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
-from simpel_cli.run import Manifest, Settings, configure, make_directory, read_manifest, refuse_occupied, stream
+from simpel_cli.run import (
+    Manifest,
+    Settings,
+    configure,
+    make_directory,
+    read_manifest,
+    refuse_changed_config,
+    refuse_occupied,
+    stream,
+)
 from simulators.model import Model
 
 WORLDS = "sim, mujoco, gymnasium:ID and folder:DIR"
@@ -74,17 +85,51 @@ def rl_online(job: Job) -> None:
         _run(config, directory, manifest)
 
 
-def resume(directory: Path) -> None:
-    """Go on with an interrupted run: every step that is complete is kept, and the result is the same."""
+def resume(directory: Path, overrides: Sequence[str] = ()) -> None:
+    """Go on with an interrupted run: every step that is complete is kept, and the result is the same.
+
+    Args:
+        directory: of the run.
+        overrides: `online.episodes=N` with more episodes than there were, or nothing.
+
+    Raises:
+        ConfigError: not such a run, or other overrides.
+    """
     record = read_manifest(directory)
     if record["command"] != "rl-online":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-online.")
+    refuse_changed_config(directory, record)
     config = load(directory / "config.yaml")
-    if record.get("status") == "done":
+    old = build(config.get("online") or {}, "online", default=Online).episodes
+    episodes = _more(overrides, old)
+    if episodes > old:
+        config["online"] = (config.get("online") or {}) | {"episodes": episodes}
+        write_text(directory / "config.yaml", dump(config))
+    elif record.get("status") == "done" and _whole(directory, old):
         Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
         return
     with Manifest(directory, "rl-online", settings_of(config)) as manifest:
         _run(config, directory, manifest)
+
+
+def _more(overrides: Sequence[str], old: int) -> int:
+    """Return how many episodes a resumed run has."""
+    for word in overrides:
+        key, _, value = word.lstrip("+").partition("=")
+        if key != "online.episodes" or not value.isdigit() or int(value) < old:
+            raise ConfigError(
+                f"--resume: got {word}; a resumed run keeps its configuration, but for more episodes: online.episodes=N with N "
+                f"of at least {old}."
+            )
+    return max([old, *(int(word.partition("=")[2]) for word in overrides)])
+
+
+def _whole(directory: Path, episodes: int) -> bool:
+    """Return whether everything is there that a finished run leaves."""
+    files = [directory / "report.html", directory / "policy" / "policy.safetensors", directory / "metrics.parquet"]
+    return all(
+        path.exists() for path in [*files, *(directory / "episodes" / f"{i:03d}.parquet" for i in range(episodes))]
+    )
 
 
 def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
@@ -109,8 +154,12 @@ def _run(config: dict[str, Any], directory: Path, manifest: Manifest) -> None:
             + (f" ({asked.truth_name})" if config["world"] == "sim" else ""),
             "task",
         )
+        for remark in remarks(asked):
+            terminal.line(remark, "look", style="yellow")
         for number in range(online.episodes):
             _episode(loop, plant, number)
+    # the last policy knows most: in its model it earns more than the one before it (online.keep_better)
+    shutil.copytree(_folder(loop, online.episodes - 1) / "policy", directory / "policy", dirs_exist_ok=True)
     write_metrics(directory / "metrics.parquet", _rows(loop), _constants(loop))
     _publish(loop)
 
@@ -134,7 +183,7 @@ def _plant(loop: Loop) -> Plant:
         return Simulated(asked.truth, encoding, goal, actor.act, horizon, key)
     if kind == "mujoco" and not rest:
         if not config.get("mujoco"):
-            raise ConfigError("world: mujoco needs a MuJoCo world, e.g. +sim@mujoco=rc_car_world.")
+            raise ConfigError("world: mujoco needs a MuJoCo world, e.g. sim@mujoco=rc_car_world.")
         source = source_of({"sim": config["mujoco"]}, settings)
         if isinstance(source, Model):
             raise ConfigError(
@@ -146,11 +195,13 @@ def _plant(loop: Loop) -> Plant:
         return Stepped(GymnasiumRig(rest, encoding, settings.seed), encoding, goal, horizon)
     if kind == "folder" and rest:
         return Exchange(
-            make_directory(Path(rest), "world", "world=folder:DIR"), encoding, goal, horizon, asked.source.dt,
+            make_directory(Path(rest), "world", "world=folder:DIR"),
+            Answers(encoding, goal, asked.task, asked.source.dt, lambda text: loop.terminal.line(text, "rig")),
             loop.online.wait, _identity(loop.directory), lambda number, ride: _accept(loop, number, ride),
             lambda text: loop.terminal.line(text, "rig"), loop.check,
         )  # fmt: skip
-    hint = did_you_mean(kind, ["sim", "mujoco", "gymnasium", "folder"])
+    kinds = ["sim", "mujoco", "gymnasium", "folder"]
+    hint = "" if kind in kinds else did_you_mean(kind, kinds)
     raise ConfigError(f"world: got {world!r}; allowed are {WORLDS}.{hint}")
 
 
@@ -174,10 +225,20 @@ def _episode(loop: Loop, plant: Plant, number: int) -> None:
     """Learn from the episodes before, act, and keep what came of it. What is complete is not done again."""
     path, folder = _file(loop, number), _folder(loop, number)
     if (folder / "round.json").exists():
-        return
+        if path.exists():
+            return
+        _withdraw(loop, plant, number)
     make_directory(folder)
     began = time.perf_counter()
-    model = learned(_fit_config(loop, number), folder / "posterior", loop.directory, shown=False)
+    try:
+        model = learned(_fit_config(loop, number), folder / "posterior", loop.directory, shown=False)
+    except NumericsError as error:
+        if not number:
+            raise
+        raise NumericsError(
+            f"{error} The model was being fitted to {number} {'episode' if number == 1 else 'episodes'}: if a sensor failed in "
+            f"the last, delete {_file(loop, number - 1)} and go on with --resume; that episode is asked for again."
+        ) from error
     fitted = time.perf_counter()
     loop.check()
     flown = _trained(loop, number, model, folder)
@@ -213,6 +274,47 @@ def _episode(loop: Loop, plant: Plant, number: int) -> None:
         loop.terminal.line(f"no model is fitted to this episode: {problem}", f"episode {number}")
 
 
+def _withdraw(loop: Loop, plant: Plant, number: int) -> None:
+    """Forget the last episode, whose file the user has deleted, and what was learned from it.
+
+    Raises:
+        ConfigError: it is not the last one.
+    """
+    later = [i for i in range(number + 1, loop.online.episodes) if _file(loop, i).exists()]
+    if later:
+        raise ConfigError(
+            f"{_file(loop, number)} is missing, but the episodes after it are there ({_file(loop, later[0]).name}, ...), whose "
+            "policies were learned from it. Put it back, or begin a new run."
+        )
+    loop.terminal.line("its file was deleted: what was learned from it is set aside", f"episode {number}")
+    (_folder(loop, number) / "round.json").unlink()
+    for i in range(number + 1, loop.online.episodes):
+        folder = _folder(loop, i)
+        if folder.exists():
+            count = len(list(folder.parent.glob(f"{folder.name}.withdrawn-*"))) + 1
+            folder.rename(folder.with_name(f"{folder.name}.withdrawn-{count}"))
+    if isinstance(plant, Exchange):
+        plant.withdraw(number)
+
+
+def _round(loop: Loop, number: int) -> dict[str, Any]:
+    """Return what is kept of a round.
+
+    Raises:
+        ConfigError: the file is damaged.
+    """
+    path = _folder(loop, number) / "round.json"
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or "return_in_model" not in found:
+            raise ValueError("not the record of a round")
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: damaged ({error}). Delete it and go on with --resume: it is made anew of what the round has left."
+        ) from error
+    return found
+
+
 def _data(loop: Loop, paths: Sequence[Path]) -> dict[str, Any]:
     """Return the data YAML of episodes."""
     own = {key: value for key, value in loop.config["data"].items() if key in MEASURED}
@@ -227,7 +329,7 @@ def _fit_config(loop: Loop, number: int) -> dict[str, Any]:
 
 def _fitted(loop: Loop, number: int) -> list[Path]:
     """Return the episodes before one that a fit can read."""
-    rounds = [json.loads((_folder(loop, i) / "round.json").read_text()) for i in range(number)]
+    rounds = [_round(loop, i) for i in range(number)]
     return [_file(loop, i) for i, facts in enumerate(rounds) if facts.get("fitted", True)]
 
 
@@ -252,6 +354,13 @@ def _accept(loop: Loop, number: int, ride: Ride) -> None:
     Raises:
         DataError: says why.
     """
+    for i in range(number):
+        before = columns_of(_file(loop, i))
+        states = zip(loop.asked.encoding.states, ride.states.T, strict=True)
+        if all(np.array_equal(before[q.name], column) for q, column in states):
+            raise DataError(
+                f"episode_{number:03d}.parquet: row by row the same as episode {i}; send the one that was driven now."
+            )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"episode_{number:03d}.parquet"
         write_ride(path, ride, loop.asked.encoding, loop.asked.source.dt)
@@ -275,12 +384,11 @@ def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
     last = _folder(loop, number - 1) if number else None
     before = last if loop.online.warm_start else None
     rival = load_policy(last / "policy")[0] if last is not None and loop.online.keep_better else None
-    done = folder / "checkpoint" / "state.safetensors"
     constants = model.study.constants | {
         "run": f"{loop.directory.name}/{number:03d}", "command": "rl-online",
         "n_train": len(model.fitted.training[0][0]),
     }  # fmt: skip
-    at = int(load_checkpoint(folder / "checkpoint")[1]["world_steps"]) if done.exists() else None
+    at = done_steps(folder)
     with MetricStream(folder, constants, resume_at=at) as metrics:
         flown = train(
             model, loop.asked, loop.terminal, metrics, folder, label=f"policy {number}", before=before, rival=rival
@@ -307,7 +415,7 @@ def _facts(loop: Loop, number: int) -> dict[str, float]:
     table = columns_of(_file(loop, number))
     good, settled = table["good"][:-1], loop.asked.task.settled
     ended = bool(len(good) >= loop.asked.task.horizon and good[-settled:].all())
-    facts: dict[str, float] = json.loads((_folder(loop, number) / "round.json").read_text())
+    facts: dict[str, float] = _round(loop, number)
     facts |= {"return": float(table["reward"].sum()), "steps": float(len(good))}
     return facts | ({"success": float(ended)} if loop.asked.task.success else {})
 
@@ -354,7 +462,8 @@ def _publish(loop: Loop) -> None:
         ))  # fmt: skip
     images = draw_online(directory) if loop.settings.figures else []
     commands = [
-        f"python {_folder(loop, last) / 'policy' / 'run_policy.py'} < states.jsonl          # no JAX needed",
+        f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # the last policy; no JAX needed",
+        f"simpel rl-online --resume {directory} online.episodes={2 * loop.online.episodes}          # more of them",
         f"simpel evaluate {_folder(loop, last) / 'posterior'} data=NAME          # the last model, on measurements of yours",
     ]
     report = write_report(
@@ -364,11 +473,12 @@ def _publish(loop: Loop) -> None:
         "the first, whose policy was learned in the prior.",
         sections=[
             {"title": "Episodes", "head": head, "rows": rows},
+            task_table(loop.asked),
             *(figure(path, f"control/{path.stem}") for path in images),
         ],
         commands=commands,
         config=dump(loop.config),
     )
     loop.terminal.line(str(report), "report")
-    for label, line in zip(["next", ""], commands, strict=True):
+    for label, line in zip(["next", "", ""], commands, strict=True):
         loop.terminal.line(f"{'' if label else ' ' * 10}{line}", label)

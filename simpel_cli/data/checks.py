@@ -17,6 +17,7 @@ from simulators.model import Quantity
 DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
 MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
 MOSTLY = 0.5  # of the values outside a range: it is the unit, not the motion
+SPIKE = 10.0  # widths of a range beyond it
 DEGREES = 361.0  # no angle in degrees within one turn reads more
 MANY_GAPS = 0.01  # of the steps; more are a clock that is irregular
 LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
@@ -188,8 +189,19 @@ def ranges(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
             cure = ""
             if outside > MOSTLY * len(values):
                 cure = in_degrees if quantity.unit.startswith("rad") else ": compare the unit of the column"
+            elif (far := _farthest(values, quantity)) is not None:
+                cure = f", as far as {far:.4g}: a spike? It spoils every fit; take it out"
             found.append(f"{name} {outside} of {len(values)} outside {box}{cure}")
     return Check("ranges", not found, "; ".join(found) if found else "all values inside the declared ranges")
+
+
+def _farthest(values: np.ndarray, quantity: Quantity) -> float | None:
+    """Return the value farthest outside the range, where that is farther than any motion goes; else None."""
+    if quantity.periodic:
+        return None
+    beyond = np.maximum(quantity.low - values, values - quantity.high) / (quantity.high - quantity.low)
+    row = int(np.argmax(np.nan_to_num(beyond, nan=-np.inf)))
+    return float(values[row]) if beyond[row] > SPIKE else None
 
 
 def _too_fast(rows: Rows, values: np.ndarray, angle: Quantity, model: Source) -> bool:

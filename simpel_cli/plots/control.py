@@ -8,6 +8,7 @@ import numpy as np
 from simpel_cli.plots.canvas import (
     BLACK,
     COLOURS,
+    DASHES,
     columns_of,
     distinct,
     legend_below,
@@ -106,10 +107,9 @@ def _curves(rows: list[dict[str, Any]]) -> Any:
         own = [r for r in rows if r["metric"] == metric]
         for j, key in enumerate(distinct((r["seed"], r["output"]) for r in own)):
             line = [(r["step"], r["value"]) for r in own if (r["seed"], r["output"]) == key]
-            axes[0].plot(
-                *zip(*line, strict=True), color=COLOURS[i], linewidth=1, alpha=0.8, label=label if j == 0 else None
-            )
-    axes[0].set(title="learning curve, a line per policy", xlabel="steps of the model", ylabel="return")
+            style = {"color": COLOURS[i], "linestyle": DASHES[j % len(DASHES)], "linewidth": 1, "alpha": 0.8}
+            axes[0].plot(*zip(*line, strict=True), label=label if j == 0 else None, **style)
+    axes[0].set(title="learning curve, dashes tell policies apart", xlabel="steps of the model", ylabel="return")
     legend_below(figure, axes[0])
     return figure
 

@@ -15,16 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from simpel_cli.encoding import Encoding
 from simpel_cli.errors import DataError
 from simpel_cli.records import write_text
-from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
-from simpel_cli.rl.task import Goal
-
-POLL = 0.2  # s
-JITTER = 0.5  # of dt: how far a row's time may be from where it should be
+from simpel_cli.rl.answers import POLL, Answers
+from simpel_cli.rl.plant import Ride
 
 
 class Exchange:
@@ -32,10 +26,7 @@ class Exchange:
 
     Args:
         folder: made if missing.
-        encoding: names of states and inputs.
-        goal: of the task.
-        horizon: steps of an episode; rows beyond them are not looked at.
-        dt: s, between rows.
+        answers: reads what comes back.
         wait: s, for an answer, until it gives up.
         run: whose exchange this is: an answer that another run asked for is none.
         accept: raises DataError of an episode, by its number, that a fit could not read.
@@ -46,17 +37,14 @@ class Exchange:
     def __init__(
         self,
         folder: Path,
-        encoding: Encoding,
-        goal: Goal,
-        horizon: int,
-        dt: float,
+        answers: Answers,
         wait: float,
         run: str,
         accept: Callable[[int, Ride], None],
         say: Callable[[str], None],
         check: Callable[[], None],
     ) -> None:
-        self.folder, self.encoding, self.goal, self.horizon, self.dt = folder, encoding, goal, horizon, dt
+        self.folder, self.answers = folder, answers
         self.wait, self.run, self.accept, self.say, self.check = wait, run, accept, say, check
 
     def ride(self, number: int, policy: Path) -> Ride:
@@ -67,23 +55,34 @@ class Exchange:
         """
         name = f"episode_{number:03d}"
         answer, asked = self.folder / f"{name}.parquet", self.folder / name / "request.json"
-        request = {"format": "simpel episode 1", "run": self.run, "answer": answer.name, "rows": self.horizon + 1}
-        if not _is(asked, request):
+        request = {"format": "simpel episode 1", "run": self.run, "answer": answer.name} | self.answers.asked
+        if (found := _read_request(asked)) != request:
             if answer.exists():
                 raise DataError(
                     f"{answer} is there, but this run did not ask for it. Use an empty folder, or move it away."
+                )
+            if found.get("run", self.run) != self.run:
+                raise DataError(
+                    f"{asked} is of another run, which waits for {answer.name}. Use another folder; if that run is over, "
+                    f"delete {asked.parent}."
                 )
             asked.unlink(missing_ok=True)  # a request of before does not stand beside half a policy
             shutil.copytree(policy, asked.parent, dirs_exist_ok=True)
             write_text(asked, json.dumps(request, indent=1))
         if not answer.exists():
-            self.say(f"waiting for {answer} ({self.horizon + 1} rows; the policy lies in {self.folder / name})")
+            self.say(f"waiting for {answer} ({request['rows']} rows; the policy lies in {self.folder / name})")
         end = time.monotonic() + self.wait
         while True:
             if answer.exists():
+                if _read_request(asked) != request:
+                    raise DataError(
+                        f"{asked} is no longer this run's request: another run uses the folder. Nothing was taken; give each "
+                        "a folder of its own, and go on with --resume."
+                    )
                 try:
-                    ride = self._read(answer)
+                    ride = self.answers.read(answer)
                     self.accept(number, ride)
+                    self.answers.remark(answer, ride, policy)
                     return ride
                 except DataError as error:
                     self._refuse(answer, str(error))
@@ -96,82 +95,25 @@ class Exchange:
                 )
             time.sleep(POLL)
 
+    def withdraw(self, number: int) -> None:
+        """Put away the answer of an episode that the user has taken back."""
+        answer = self.folder / f"episode_{number:03d}.parquet"
+        if answer.exists():
+            self._put_away(answer, "withdrawn")
+
+    def _put_away(self, answer: Path, why: str) -> Path:
+        count = len(list(self.folder.glob(f"{answer.stem}.{why}-*.parquet"))) + 1
+        return answer.rename(answer.with_name(f"{answer.stem}.{why}-{count}.parquet"))
+
     def _refuse(self, answer: Path, problem: str) -> None:
-        count = len(list(self.folder.glob(f"{answer.stem}.refused-*.parquet"))) + 1
-        kept = answer.with_name(f"{answer.stem}.refused-{count}.parquet")
-        answer.rename(kept)
+        kept = self._put_away(answer, "refused")
         write_text(kept.with_suffix(".txt"), f"{problem}\n")
         self.say(f"refused: {problem} It is kept as {kept.name}; waiting for another {answer.name}")
 
-    def _read(self, path: Path) -> Ride:
-        table = _table(path)
-        rows = min(len(next(iter(table.values()), ())), self.horizon + 1)
-        if rows < LEAST_ROWS:
-            raise DataError(f"{path.name}: {rows} rows; an episode has {LEAST_ROWS} at least.")
-        self._in_time(table, path, rows)
-        states = np.stack([self._column(table, path, q.name, rows) for q in self.encoding.states], axis=1)
-        # of the last row nobody sees what its command led to, so that a rig need not know it
-        commands = np.stack([self._column(table, path, q.name, rows - 1) for q in self.encoding.inputs], axis=1)
-        low, high = np.array(self.goal.low), np.array(self.goal.high)
-        beyond = (commands < low - 1e-3 * (high - low)) | (commands > high + 1e-3 * (high - low))
-        if beyond.any():
-            row, column = np.argwhere(beyond)[0]
-            q = self.encoding.inputs[column]
-            raise DataError(
-                f"{path.name}, row {row}: {q.name} is {commands[row, column]:g} {q.unit}; allowed are "
-                f"{low[column]:g} to {high[column]:g}."
-            )
-        reward, good, over = earned(self.goal, self.encoding, states[1:], commands)
-        last = int(np.argmax(over)) + 1 if over.any() else len(reward)
-        if last < self.horizon and not over.any():
-            self.say(f"{path.name} has {rows} rows of {self.horizon + 1}: taken as an episode that was cut short")
-        return Ride(states[: last + 1], commands[:last], reward[:last], good[:last])
 
-    def _in_time(self, table: dict[str, np.ndarray], path: Path, rows: int) -> None:
-        """Compare the column `t`, if there is one, with the rows' distance."""
-        if "t" not in table:
-            return
-        times = table["t"][:rows]
-        if np.issubdtype(times.dtype, np.datetime64):
-            times = (times - times[0]) / np.timedelta64(1, "s")
-        times = self._column({"t": times}, path, "t", rows)
-        late = np.flatnonzero(np.abs(times - times[0] - self.dt * np.arange(rows)) > JITTER * self.dt)
-        if len(late):
-            raise DataError(
-                f"{path.name}, row {late[0]}: t is {times[late[0]] - times[0]:g} s after the first row, where a row every "
-                f"{self.dt:g} s (sim.dt) has {self.dt * late[0]:g}. Send a row every {self.dt:g} s, or leave t out."
-            )
-
-    def _column(self, table: dict[str, np.ndarray], path: Path, name: str, rows: int) -> np.ndarray:
-        if name not in table:
-            raise DataError(f"{path.name}: the column {name} is missing; it has {', '.join(table)}.")
-        try:
-            values = np.asarray(table[name][:rows], float)
-        except (TypeError, ValueError):
-            raise DataError(f"{path.name}: the column {name} holds something other than numbers.") from None
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            raise DataError(f"{path.name}, row {bad[0]}: {name} is {values[bad[0]]}, not a finite number.")
-        return values
-
-
-def _is(path: Path, request: dict[str, Any]) -> bool:
+def _read_request(path: Path) -> dict[str, Any]:
     try:
-        return bool(json.loads(path.read_text()) == request)
+        found = json.loads(path.read_text())
     except (OSError, ValueError):
-        return False
-
-
-def _table(path: Path) -> dict[str, np.ndarray]:
-    """Read a Parquet file; one that is still being written is given a moment."""
-    import pyarrow.parquet as pq
-
-    problem: Any = None
-    for _ in range(25):
-        try:
-            table = pq.read_table(path)
-            return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-        except (OSError, ValueError) as error:
-            problem = error
-            time.sleep(POLL)
-    raise DataError(f"{path.name}: no readable Parquet file ({str(problem).splitlines()[0]}).")
+        return {}
+    return found if isinstance(found, dict) else {}

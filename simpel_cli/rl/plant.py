@@ -79,10 +79,19 @@ def earned(
         after: states after every step, (T, ds).
         commands: of every step, (T, du).
         before: command of the step before the first, (du,); None: nobody had given one.
+
+    Raises:
+        DataError: a reward is not finite.
     """
     earlier = np.concatenate([np.array([goal.rest if before is None else before]), commands[:-1]])
     wrapped = encoding.decode(encoding.encode(after))
     judged = goal.judge(jnp.asarray(wrapped), jnp.asarray(commands), jnp.asarray(earlier))
+    bad = np.flatnonzero(~np.isfinite(np.asarray(judged.reward)))
+    if len(bad):
+        where = ", ".join(f"{q.name} = {v:.4g}" for q, v in zip(encoding.states, after[bad[0]], strict=True))
+        raise DataError(
+            f"the reward is {np.asarray(judged.reward)[bad[0]]} after step {bad[0]}, at {where}; see reward.reward."
+        )
     return np.asarray(judged.reward), np.asarray(judged.good), np.asarray(judged.over)
 
 

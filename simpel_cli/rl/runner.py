@@ -4,7 +4,8 @@ runner = PolicyRunner("policy")
 command = runner.command({"phi": 3.1, "omega": 0.0})     # every dt seconds; a dict of commands in physical units
 runner.reset()                                           # at the start of every episode
 
-As a program it reads a JSON object of states per line and answers with one of commands; an empty line starts a new episode:
+As a program it reads a JSON object of states per line and answers with one of commands, or with {"error": ...} where the line
+is none; an empty line starts a new episode:
 
     python run_policy.py < states.jsonl
 """
@@ -72,11 +73,19 @@ def main() -> None:
     """Answer states on standard input with commands on standard output."""
     runner = PolicyRunner(Path(__file__).parent)
     for line in sys.stdin:
-        if line.strip():
-            sys.stdout.write(json.dumps(runner.command(json.loads(line))) + "\n")
-            sys.stdout.flush()
-        else:
+        if not line.strip():
             runner.reset()
+            continue
+        answer: dict[str, float] | dict[str, str]
+        try:
+            answer = runner.command(json.loads(line))
+        except (KeyError, TypeError, ValueError) as error:  # the rig goes on; nothing was remembered of this line
+            needed = ", ".join(f"{q['name']} [{q['unit']}]" for q in runner.facts["states"])
+            answer = {
+                "error": f"needed is a JSON object with finite numbers for {needed}; got {line.strip()} ({error})"
+            }
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import casadi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from simpel_cli.casadi_jax import checked
@@ -16,6 +17,7 @@ from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.expression import ExpressionError, parse, symbols_used
 from simulators.quantity import Quantity
 
+POINTS = 512  # of the declared ranges, at which a reward is looked at
 BEFORE = "_before"  # of an input's name: the command of the step before
 
 
@@ -117,6 +119,15 @@ class Task:
 
         return Goal(start, judge, uses_before, tuple(low for low, _ in ends), tuple(high for _, high in ends))
 
+    def begins(self, state: str) -> tuple[float, float]:
+        """Return between which values nearly all episodes begin."""
+        node = self.initial.get(state, 0.0)
+        if isinstance(node, Mapping):
+            return node["mean"] - 4 * node["std"], node["mean"] + 4 * node["std"]
+        low, high = node if isinstance(node, list | tuple) else (node, node)
+        slack = 0.1 * (high - low) + 1e-9 + 0.01 * max(abs(low), abs(high))
+        return float(low - slack), float(high + slack)
+
     def _judge(self, encoding: Encoding) -> tuple[Callable[..., Judged], bool]:
         groups = [
             [q.name for q in encoding.states],
@@ -139,6 +150,7 @@ class Task:
         angles = {q.name for q in encoding.states if q.periodic}
         box = [(-math.pi, math.pi) if q.name in angles else (q.low, q.high) for q in encoding.states]
         ends = [(q.low, q.high) for q in encoding.inputs]
+        _refuse_not_finite(self.reward, function, groups, [box, ends, ends])
         converted = checked(function, [box, ends, ends])
 
         def judge(states: Float[Array, "B ds"], commands: Float[Array, "B du"], before: Float[Array, "B du"]) -> Judged:
@@ -158,6 +170,32 @@ class Task:
                 f"[{quantity.low:g}, {quantity.high:g}]."
             )
         return float(ends[0]), float(ends[1])
+
+
+def _refuse_not_finite(
+    text: str, function: casadi.Function, groups: list[list[str]], boxes: list[list[tuple[float, float]]]
+) -> None:
+    """Refuse a reward that is no number somewhere in the declared ranges: a policy would learn to stay away from there.
+
+    Raises:
+        ConfigError: says where.
+    """
+    random = np.random.default_rng(0)
+    points = [
+        np.array([random.uniform(low, high, POINTS) for low, high in box]).reshape(len(box), POINTS) for box in boxes
+    ]
+    values = np.asarray(function.map(POINTS)(*points))[0]
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        where = ", ".join(
+            f"{name}={column[bad[0]]:.3g}"
+            for names, box in zip(groups[:2], points[:2], strict=True)
+            for name, column in zip(names, box, strict=True)
+        )
+        raise ConfigError(
+            f"reward.reward: {text!r} is {values[bad[0]]} at {where}; it must be a finite number everywhere in the declared "
+            "ranges, e.g. sqrt(max(x, 0)) in place of sqrt(x)."
+        )
 
 
 def _term(path: str, text: Any, scope: Mapping[str, Any]) -> Any:
