@@ -172,7 +172,12 @@ def resume(root: Path, overrides: list[str]) -> None:
                 f"--resume: {word} is not of the launcher; the jobs are those of {root / RECORD}. For others start a new sweep."
             )
     keys = {word.partition("=")[0] for word in [*overrides, "hydra.sweep.dir="]}
-    kept = [word for word in record.words if word.partition("=")[0] not in keys]
+    other = "hydra/launcher" in keys  # the options of the one before are none of its
+    kept = [
+        word
+        for word in record.words
+        if word.partition("=")[0] not in keys and not (other and word.startswith("hydra.launcher."))
+    ]
     _run(record, [*kept, *overrides, f"hydra.sweep.dir='{root.absolute()}'"])
 
 
