@@ -16,7 +16,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
+.PHONY: help install docs demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -48,6 +48,11 @@ lint: install ## Format, lint, layers, types, lock
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(UV) lock --check --no-config
+
+docs: $(STAMP) ## Build the documentation site from docs/ into site/
+	UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never $(UV) sync --group docs --inexact --frozen --quiet --python $(PYTHON)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site/index.html"
 
 format: install ## Format the code
 	$(BIN)/ruff format .
