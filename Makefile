@@ -9,6 +9,8 @@ RIVALS := $(VENV)/.rivals
 WORKERS ?= 2
 WORDS ?= experiment=pendulum
 SETS ?= 600
+KILLS ?= 60
+MUTATIONS ?= 500
 SEED ?= 1
 OUT ?= runs/$@/$$(date +%Y%m%d-%H%M%S)
 size ?= small
@@ -16,7 +18,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install docs demo test test-slow lint format bench bench-discover sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
+.PHONY: help install docs demo test test-slow lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -61,6 +63,9 @@ format: install ## Format the code
 bench: install ## Measure scores of every method, and speed of every estimator, on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
 	$(BIN)/python -m tests.benchmarks.speed estimators
+
+torture: install ## Kill, starve and mislead every verb (KILLS=60 MUTATIONS=500 SEED=0 OUT=DIR); about two hours
+	$(BIN)/python -m tests.torture --kills $(KILLS) --mutations $(MUTATIONS) --seed $(SEED) --out $(OUT)
 
 sbc: install ## Calibrate the inference of an experiment on functions of its own prior (WORDS="experiment=pendulum method=fsvgd")
 	$(BIN)/python -m tests.benchmarks.sbc $(WORDS)

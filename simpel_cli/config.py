@@ -217,7 +217,7 @@ def load(path: Path) -> dict[str, Any]:
         config = yaml.safe_load(path.read_text())
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: missing; the directory is not a run that can be read back.") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise ConfigError(f"{path}: not readable ({str(error).splitlines()[0]}).") from error
     if not isinstance(config, dict):
         raise ConfigError(f"{path}: not a configuration of simpel.")

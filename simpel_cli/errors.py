@@ -3,6 +3,8 @@
 A message names the key or file, what was given, what is allowed and the cure.
 """
 
+from collections.abc import Sequence
+
 
 class SimpelError(Exception):
     """Base of every error that is shown as one message without a traceback."""
@@ -40,11 +42,13 @@ class Interrupted(SimpelError):  # noqa: N818 (a state that was saved, not a fau
     exit_code = 130
 
 
-def did_you_mean(word: str, allowed: list[str]) -> str:
+def did_you_mean(word: object, allowed: Sequence[object]) -> str:
     """Return `" Did you mean X?"` for a near miss of `word` in `allowed`, else an empty string."""
     from difflib import get_close_matches
 
-    close = get_close_matches(word, allowed, n=1, cutoff=0.6)
+    close = get_close_matches(
+        str(word), [str(name) for name in allowed], n=1, cutoff=0.6
+    )  # YAML reads 1e999 as a number
     return f" Did you mean {close[0]}?" if close else ""
 
 

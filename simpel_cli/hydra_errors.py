@@ -38,6 +38,10 @@ def translated(
     elif own and isinstance(error, ValueError) and "Config group override must be" in str(error):
         groups = ", ".join(name for name in known if name != "choices")
         message = f"a group cannot be null: name one of its options, e.g. method=simpel (groups and keys: {groups})."
+    elif own and isinstance(error, ValueError) and "integer string conversion" in str(error):
+        message = "a YAML holds a number of thousands of digits; the largest that a computer has is about 1e308."
+    elif own and isinstance(error, RecursionError):
+        message = "a YAML refers to itself (an anchor inside what it names, e.g. &a [*a]); write out what is meant."
     if message is None:
         return error
     refusal = ConfigError(message)

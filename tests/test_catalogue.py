@@ -48,6 +48,14 @@ def test_wrong_names(tmp_path: Path, words: tuple[str, ...], message: str) -> No
     assert message in result.err
 
 
+@pytest.mark.parametrize("value", ["9" * 5000, "&a [*a, *a]"])
+def test_a_yaml_that_no_computer_can_hold(value: str, tmp_path: Path) -> None:
+    my = rig(tmp_path, cart=CART.replace("dt: 0.05", f"dt: {value}"))
+    for words in (("sims", "cart", "--config-dir", my), ("fit", "--config-dir", my, "sim=cart", "data=rig")):
+        result = simpel(tmp_path, *words)
+        assert (result.code, "Traceback" in result.err) == (2, False), result.err
+
+
 def test_doctor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = simpel(tmp_path, "doctor")
     assert (result.code, result.err) == (0, "")

@@ -165,7 +165,7 @@ def _entries(group: str, config_dir: Path | None) -> list[Entry]:
 def _chosen(group: str, name: str, every: Sequence[Entry]) -> Entry:
     for entry in every:
         if entry.name == name:
-            return entry
+            return entry if entry.node else entry._replace(node=load(entry.path))  # says what is wrong with the file
     names = [entry.name for entry in every]
     raise ConfigError(
         f"{group}: got {name}; there is no such one.{did_you_mean(name, names)} `simpel {group}s` lists them."
