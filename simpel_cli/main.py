@@ -367,6 +367,21 @@ def main() -> None:
         # the reader of `--cfg` went away: end quietly, as other tools do (a run goes on, see `Terminal`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except OSError as error:
+        _fail(_of_the_disk(error), 1)
+
+
+def _of_the_disk(error: OSError) -> str:
+    """Say what the system does not allow; anything else is a fault of ours, and shows where."""
+    import errno
+
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO):
+        raise error
+    where = f"{error.filename}: " if error.filename else ""
+    return (
+        f"{where}{error.strerror}. What was complete before is kept; make room or give another place (hydra.run.dir=DIR), and "
+        "go on with --resume where the run has begun."
+    )
 
 
 def _command_path(error: Exception) -> str:

@@ -7,6 +7,7 @@ leaves the old one. Nothing that is loaded is ever unpickled.
 import contextlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -150,6 +151,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 def save_checkpoint(directory: Path, leaves: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
     """Write `state.safetensors` and the JSON facts inside its header, as one atomic file."""
+    from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
     directory.mkdir(exist_ok=True)
@@ -157,7 +159,12 @@ def save_checkpoint(directory: Path, leaves: dict[str, np.ndarray], facts: dict[
         stale.unlink(missing_ok=True)
     with replacing(directory / "state.safetensors") as temporary:
         contiguous = {name: np.ascontiguousarray(a) for name, a in leaves.items()}
-        save_file(contiguous, temporary, metadata={"simpel": json.dumps(facts)})
+        try:
+            save_file(contiguous, temporary, metadata={"simpel": json.dumps(facts)})
+        except SafetensorError as error:
+            if found := re.search(r"os error (\d+)", str(error)):  # of the disk, not of what is written
+                raise OSError(int(found[1]), os.strerror(int(found[1])), str(directory)) from error
+            raise
 
 
 def load_checkpoint(directory: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,5 +1,6 @@
 """What surrounds a computation: settings, device and precision, run directory, named random streams, manifest."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -187,14 +188,17 @@ class Manifest:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if error is None:
-            self.write("done")
-        elif isinstance(error, Interrupted | KeyboardInterrupt):
-            self.write("interrupted", str(error))
-        else:
-            text = str(error) if isinstance(error, SimpelError) else f"{type(error).__name__}: {error}"
-            self.write("failed", text)
-        self._lock.close()
+        try:
+            if error is None:
+                self.write("done")
+            elif isinstance(error, Interrupted | KeyboardInterrupt):
+                self.write("interrupted", str(error))
+            else:
+                text = str(error) if isinstance(error, SimpelError) else f"{type(error).__name__}: {error}"
+                with contextlib.suppress(OSError):  # a full disk: the first error is the one to tell
+                    self.write("failed", text)
+        finally:
+            self._lock.close()
 
 
 def locked(directory: Path) -> Any:

@@ -1,6 +1,8 @@
 """The verbs from end to end, with tiny settings: files of the contract, repeatability, evaluation, simulation, words."""
 
+import errno
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -392,3 +394,13 @@ class TestWords:
         words = [sys.executable, "-c", code]
         found = subprocess.run(words, capture_output=True, text=True, check=True, env=environment())
         assert found.stdout.strip() == ""
+
+
+def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, text: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr("simpel_cli.run.write_text", full)
+    result = simpel(tmp_path, *FIT, "hydra.run.dir=run")
+    assert result.code == 1
+    assert "run/manifest.json: No space left on device. What was complete before is kept; make room" in result.err

@@ -65,7 +65,7 @@ def verbs(fitted: str) -> list[Verb]:
             (), ("verdict.json", "candidates.parquet"),
         ),
         Verb("evaluate", ("evaluate", fitted, "hydra.run.dir=DIR"), (), ("metrics.parquet",)),
-        Verb("simulate", ("simulate", "sim=pendulum_world", "out=DIR"), (), ("data.parquet",)),
+        Verb("simulate", ("simulate", "sim=pendulum_world", "out=DIR"), (), ("measurements.parquet",)),
         Verb("report", ("report", fitted, "--out", "DIR"), (), ()),
         Verb("export", ("export", fitted, "--out", "DIR"), (), ("posterior.safetensors", "simulator.casadi", "simulator.c")),
     ]  # fmt: skip
