@@ -184,7 +184,11 @@ class Manifest:
 
     def __enter__(self) -> "Manifest":
         self._lock = locked(self.directory)
-        self.write("running")
+        try:
+            self.write("running")
+        except BaseException:
+            self._lock.close()
+            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
