@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.tensorboard import Scalars
 
 COLUMNS = (
     ("run", "string"), ("command", "string"), ("experiment", "string"), ("method", "string"), ("sim", "string"),
@@ -79,10 +80,19 @@ class MetricStream:
     Args:
         directory: the run directory.
         constants: values of the columns that are the same in every row of the run.
+        resume_at: step of the checkpoint that the run goes on from; None: it begins.
+        scalars: takes the rows as well, e.g. `tensorboard.Scalars`.
     """
 
-    def __init__(self, directory: Path, constants: dict[str, Any], *, resume_at: int | None = None) -> None:
-        self.directory, self.constants = directory, constants
+    def __init__(
+        self,
+        directory: Path,
+        constants: dict[str, Any],
+        *,
+        resume_at: int | None = None,
+        scalars: Scalars | None = None,
+    ) -> None:
+        self.directory, self.constants, self.scalars = directory, constants, scalars
         self.path = directory / "metrics.jsonl"
         kept = (
             [] if resume_at is None else [r for r in self._read() if r["split"] == "train" and r["step"] <= resume_at]
@@ -95,12 +105,17 @@ class MetricStream:
 
     def __exit__(self, *error: object) -> None:
         self._file.close()  # the stream stays, so that the run can go on
+        if self.scalars is not None:
+            self.scalars.close()
 
     def add(self, rows: Iterable[dict[str, Any]]) -> None:
         """Append rows: any of seed, step, split, metric, output, unit, value."""
+        rows = list(rows)
         for row in rows:
             self._file.write(json.dumps(row) + "\n")
         self._file.flush()
+        if self.scalars is not None:
+            self.scalars.add(rows)
 
     def close(self) -> Path:
         """Write `metrics.parquet` from the stream and remove the stream."""

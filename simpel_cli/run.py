@@ -43,6 +43,7 @@ class Settings:
         cache: keep compiled programs in the user's cache directory.
         quiet: print errors only.
         figures: draw figures; without them the report has its tables, and a small job of a large sweep ends sooner.
+        tensorboard: write scalars for TensorBoard into `tensorboard/` of the run, too.
         plugins: packages of the user's that `_target_` and callables may name.
     """
 
@@ -54,6 +55,7 @@ class Settings:
     cache: bool = True
     quiet: bool = False
     figures: bool = True
+    tensorboard: bool = False
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

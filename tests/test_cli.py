@@ -404,3 +404,14 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = simpel(tmp_path, *FIT, "hydra.run.dir=run")
     assert result.code == 1
     assert "run/manifest.json: No space left on device. What was complete before is kept; make room" in result.err
+
+
+def test_scalars_for_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = simpel(tmp_path, *FIT, "run.tensorboard=true", "hydra.run.dir=run")
+    assert result.code == 0, result.err
+    (events,) = (tmp_path / "run" / "tensorboard").iterdir()
+    for tag in (b"train/loss", b"train/noise_std/omega", b"test/nll/joint"):
+        assert tag in events.read_bytes()
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    result = simpel(tmp_path, *FIT, "run.tensorboard=true", "hydra.run.dir=without")
+    assert (result.code, "pip install 'simpel[tensorboard]'" in result.err) == (2, True)

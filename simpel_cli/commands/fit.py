@@ -19,6 +19,7 @@ from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.records import MetricStream, write_table, write_text
 from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_changed_config, refuse_occupied, sha256
+from simpel_cli.tensorboard import Scalars
 
 LOG_EVERY = 50  # steps per row of the metric table
 DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
@@ -99,7 +100,9 @@ def _run(
     program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
     constants = study.constants | {"run": directory.name, "command": "fit", "n_train": len(fitted.training[0][0])}
     began = time.perf_counter()
-    with MetricStream(directory, constants, resume_at=start if resume else None) as metrics:
+    since = start if resume else None
+    scalars = Scalars(directory, since) if study.settings.tensorboard else None
+    with MetricStream(directory, constants, resume_at=since, scalars=scalars) as metrics:
         state = _train(study, fitted, program, terminal, metrics, directory, state, start)
         manifest.facts |= {
             "compile_seconds": round(program.compile_seconds, 3),

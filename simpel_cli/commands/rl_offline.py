@@ -38,6 +38,7 @@ from simpel_cli.run import (
     refuse_occupied,
     stream,
 )
+from simpel_cli.tensorboard import Scalars
 
 OWN = (
     "policy",
@@ -97,7 +98,9 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     constants = study.constants | {
         "run": directory.name, "command": "rl-offline", "n_train": len(model.fitted.training[0][0])
     }  # fmt: skip
-    with MetricStream(directory, constants, resume_at=done_steps(directory)) as metrics:
+    since = done_steps(directory)
+    scalars = Scalars(directory, since) if study.settings.tensorboard else None
+    with MetricStream(directory, constants, resume_at=since, scalars=scalars) as metrics:
         if asked.planner is None:
             flown = train(model, asked, terminal, metrics, directory)
             judged = _in_truth(model, asked, flown)

@@ -42,6 +42,7 @@ from simpel_cli.run import (
     refuse_occupied,
     stream,
 )
+from simpel_cli.tensorboard import Scalars
 from simulators.model import Model
 
 WORLDS = "sim, mujoco, gymnasium:ID and folder:DIR"
@@ -389,7 +390,8 @@ def _trained(loop: Loop, number: int, model: Learned, folder: Path) -> Flown:
         "n_train": len(model.fitted.training[0][0]),
     }  # fmt: skip
     at = done_steps(folder)
-    with MetricStream(folder, constants, resume_at=at) as metrics:
+    scalars = Scalars(folder, at) if loop.settings.tensorboard else None
+    with MetricStream(folder, constants, resume_at=at, scalars=scalars) as metrics:
         flown = train(
             model, loop.asked, loop.terminal, metrics, folder, label=f"policy {number}", before=before, rival=rival
         )
