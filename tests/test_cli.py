@@ -48,7 +48,7 @@ class TestFit:
         expected = {
             "manifest.json", "config.yaml", "metrics.parquet", "predictions.parquet", "calibration.parquet",
             "horizon.parquet", "trajectories.parquet", "prior_predictive.parquet", "checkpoint/state.safetensors", "run.log",
-            "report.html",
+            "report.html", ".lock",
             ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml",
         }  # fmt: skip
         assert expected <= names
