@@ -65,6 +65,15 @@ def unknown_root(key: str, verb: str, known: list[str]) -> str:
     return f"{key}: no such key or group of `simpel {verb}`.{did_you_mean(key, shown)} (it has: {', '.join(shown)})"
 
 
+def _extra(launcher: str) -> str:
+    """Return how a launcher is installed that is an extra."""
+    extra = next(
+        (extra for word, extra in {"slurm": "slurm", "submitit": "slurm", "ray": "ray"}.items() if word in launcher), ""
+    )
+    names = {"slurm": "submitit_slurm and submitit_local", "ray": "ray"}
+    return f" {names[extra]}: pip install 'simpel[{extra}]'." if extra else ""
+
+
 def _one_line(error: Exception, verb: str, known: list[str], folders: list[Path]) -> str:
     """Say in one line what Hydra and OmegaConf say in ten."""
     text = str(error)
@@ -73,7 +82,8 @@ def _one_line(error: Exception, verb: str, known: list[str], folders: list[Path]
         group, choice, listing = found.groups()
         options = [o for o in listing.split() if o and not o.startswith("Config")]
         options = options[: options.index("search")] if "search" in options else options
-        return f"{group}: no option {choice!r}.{did_you_mean(choice, options)} (available: {', '.join(options)})"
+        hint = "" if group != "hydra/launcher" else _extra(choice)
+        return f"{group}: no option {choice!r}.{did_you_mean(choice, options)}{hint} (available: {', '.join(options)})"
     if found := re.search(r"Could not load '([\w/@.\-]+)/([^'/]*)'", text):  # an entry of a list of choices
         group, choice = found.groups()
         options = sorted({p.stem for folder in folders for p in (folder / group).glob("*.yaml")})

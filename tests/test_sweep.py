@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -147,6 +148,25 @@ def test_another_launcher_of_hydra_runs_the_same_jobs(tmp_path: Path) -> None:
     changed = simpel(tmp_path, "sweep", "--resume", "sweep", "hydra.launcher.workers=1")
     assert "0: done before with another configuration (method.learning_rate: 0.001, now 0.002)" in changed.err
     assert statuses(tmp_path / "sweep", 2) == ["done", "done"]
+
+
+def test_another_launcher_that_fails_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def launch(*_: object, **__: object) -> None:
+        raise OSError("no such partition")
+
+    monkeypatch.setattr("simpel_cli.commands.sweep.launch", launch)
+    result = simpel(tmp_path, "sweep", "experiment=pendulum", *TINY, "run.seed=0,1", "hydra/launcher=basic")
+    assert result.code == 1
+    assert "error: hydra/launcher=basic: OSError: no such partition" in result.err
+
+
+@pytest.mark.parametrize(("name", "extra"), [("submitit_slurm", "slurm"), ("slurm", "slurm"), ("ray", "ray")])
+def test_a_launcher_that_is_an_extra(tmp_path: Path, name: str, extra: str) -> None:
+    if any(metadata.distributions(name=f"hydra-{extra.replace('slurm', 'submitit')}-launcher")):
+        pytest.skip(f"{extra} is installed")
+    result = simpel(tmp_path, "sweep", "experiment=pendulum", "run.seed=0,1", f"hydra/launcher={name}")
+    assert f"no option '{name}'" in result.err
+    assert f"pip install 'simpel[{extra}]'" in result.err
 
 
 def test_two_sweeps_in_one_directory(tmp_path: Path) -> None:

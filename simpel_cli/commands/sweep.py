@@ -193,6 +193,15 @@ def _run(record: Record, words: list[str]) -> None:
             # another launcher may carry the task to another process: a plain function, without what holds workers
             launch(_root_of(record.verb), own.add if ours else perform, words, config_dir=folder, flags=["-m"])
             own.wait()
+        except SimpelError:
+            raise
+        except Exception as error:
+            if ours:
+                raise
+            raise SimpelError(  # somebody else's: what it was given, or where it runs jobs
+                f"hydra/launcher={value_of('hydra/launcher', words)}: {type(error).__name__}: {error} "
+                "`simpel sweep --resume DIR` goes on; hydra/launcher=dask, the default, needs nothing but this machine."
+            ) from error
         finally:
             own.close()
             root = own.root if ours else sweep_directory()
