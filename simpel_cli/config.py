@@ -97,7 +97,8 @@ def launch(
     typed = {word.lstrip("+~").partition("=")[0].partition(".")[0] for word in overrides}
 
     def entry(config: Any) -> Any:
-        register_resolvers()  # a launcher may have carried this to another process
+        if not OmegaConf.has_resolver("run_id"):  # a launcher has carried this to another process
+            register_resolvers()
         try:
             hydra_config = HydraConfig.get()
             plain = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
@@ -155,6 +156,17 @@ def count_jobs(overrides: list[str]) -> int:
 
     parsed = OverridesParser.create().parse_overrides(checked(overrides))
     return math.prod(sum(1 for _ in o.sweep_iterator()) for o in parsed if o.is_sweep_override())
+
+
+def first_job(overrides: list[str]) -> list[str]:
+    """Return the overrides of the first job of a multirun."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_overrides(checked(overrides))
+    return [
+        f"{o.get_key_element()}={next(iter(o.sweep_string_iterator()))}" if o.is_sweep_override() else word
+        for word, o in zip(overrides, parsed, strict=True)
+    ]
 
 
 def value_of(key: str, overrides: list[str]) -> str | None:

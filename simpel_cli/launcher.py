@@ -4,13 +4,12 @@ import importlib.util
 import sys
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.plugins import Plugins
 from hydra.experimental.callback import Callback
 
-NAME = "dask"
 directories: list[Path] = []  # of the multiruns that this process has started
 
 
@@ -21,9 +20,17 @@ class DaskLauncher(BasicLauncher):
         options: of the cluster, see `conf/hydra/launcher/dask.yaml`; jobs carry them to `commands.cluster`.
     """
 
+    chosen: ClassVar[bool] = False  # by the multirun of this process: options of a user's own may have any name
+    queue: ClassVar[Any] = None  # of that multirun: takes its jobs
+
     def __init__(self, **options: Any) -> None:
         super().__init__()
         self.options = options
+
+    def setup(self, **hydra: Any) -> None:
+        """Hydra has chosen it."""
+        super().setup(**hydra)
+        DaskLauncher.chosen = True
 
 
 # Hydra takes plug-ins from modules of the namespace `hydra_plugins` only: this module is one of them under another name

@@ -300,6 +300,20 @@ def effects(
 
 
 @app.command()
+def example(
+    folder: Annotated[Path, typer.Argument(help="A new or empty folder.")],
+) -> None:
+    """Write the folder of a rig, to be changed into your own: simulator, measurements, effect, task, experiment.
+
+    Examples:
+      simpel example my
+    """
+    from simpel_cli.commands.example import example as task
+
+    task(folder)
+
+
+@app.command()
 def doctor() -> None:
     """Tell what this installation has, and test in a few seconds whether it computes right."""
     from simpel_cli.commands.doctor import doctor as task

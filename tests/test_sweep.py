@@ -32,12 +32,14 @@ def statuses(sweep: Path, jobs: int) -> list[str]:
 
 
 def test_a_job_that_fails_costs_itself_only(tmp_path: Path) -> None:
-    words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1")
-    words = (*words, "hydra.sweep.dir=sweep", "hydra.launcher.workers=1")
-    result = simpel(tmp_path, "sweep", *words)
-    assert result.code == 2
-    assert "1 of 2 jobs failed, the others are collected" in result.err
-    assert "method.learning_rate: got -1.0; it must be positive" in result.err
+    words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1", "hydra.launcher.workers=1")
+    first = simpel(tmp_path, "sweep", *words)  # into a directory of its own
+    (folder,) = (tmp_path / "runs" / "sweep" / "pendulum").iterdir()
+    folder.rename(tmp_path / "sweep")
+    words = (*words, "hydra.sweep.dir=sweep")
+    assert first.code == 2
+    assert "1 of 2 jobs failed, the others are collected" in first.err
+    assert "method.learning_rate: got -1.0; it must be positive" in first.err
     table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
     assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
     assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]

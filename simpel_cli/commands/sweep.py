@@ -13,11 +13,11 @@ from typing import Any
 from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
 from simpel_cli.commands.gather import Found
 from simpel_cli.commands.job import Outcome, perform
-from simpel_cli.config import Job, count_jobs, launch, sweep_directory, value_of
+from simpel_cli.config import Job, count_jobs, first_job, launch, sweep_directory, value_of
 from simpel_cli.console import Board, Terminal
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.interruption import interruption
-from simpel_cli.launcher import NAME
+from simpel_cli.launcher import DaskLauncher
 from simpel_cli.run import locked
 
 LOOK = 0.2  # s between two looks at what has ended
@@ -143,7 +143,7 @@ def sweep(verb: str, overrides: list[str], config_dir: Path | None, cfg: str | N
         SimpelError: a job failed; everything else was collected, and the error says where.
     """
     if cfg:
-        launch(_root_of(verb), perform, overrides, config_dir=config_dir, flags=["--cfg", cfg])
+        launch(_root_of(verb), perform, first_job(overrides), config_dir=config_dir, flags=["--cfg", cfg])
         return
     given = value_of("hydra.sweep.dir", overrides)
     if given is not None and (Path(given) / RECORD).exists():
@@ -185,18 +185,17 @@ def _run(record: Record, words: list[str]) -> None:
     terminal = Terminal((value_of("run.quiet", words) or "").lower() == "true")
     terminal.line(f"simpel sweep · {record.verb} · {record.jobs} {'job' if record.jobs == 1 else 'jobs'}", style="bold")
     folder = Path(record.config_dir) if record.config_dir else None
-    ours = (value_of("hydra/launcher", words) or NAME) == NAME
     left: list[Found] = []
     with interruption() as stop:
         own = Sweep(record, terminal, stop)
+        DaskLauncher.chosen, DaskLauncher.queue = False, own.add
         try:
-            # another launcher may carry the task to another process: a plain function, without what holds workers
-            launch(_root_of(record.verb), own.add if ours else perform, words, config_dir=folder, flags=["-m"])
+            launch(_root_of(record.verb), _queue_or_perform, words, config_dir=folder, flags=["-m"])
             own.wait()
         except SimpelError:
             raise
         except Exception as error:
-            if ours:
+            if DaskLauncher.chosen:
                 raise
             raise SimpelError(  # somebody else's: what it was given, or where it runs jobs
                 f"hydra/launcher={value_of('hydra/launcher', words)}: {type(error).__name__}: {error} "
@@ -204,6 +203,7 @@ def _run(record: Record, words: list[str]) -> None:
             ) from error
         finally:
             own.close()
+            ours = DaskLauncher.chosen
             root = own.root if ours else sweep_directory()
             if root is not None and (own.outcomes or not ours):
                 if not ours:
@@ -212,6 +212,11 @@ def _run(record: Record, words: list[str]) -> None:
     _refuse_failed(own.outcomes)
     if left:  # where another launcher ran them, nothing else tells
         raise SimpelError(f"{len(left)} of {record.jobs} jobs are not done, the others are collected.")
+
+
+def _queue_or_perform(job: Job) -> Any:
+    """Take a job. Another launcher may carry this to another process: a plain function, without what holds workers."""
+    return DaskLauncher.queue(job) if DaskLauncher.chosen else perform(job)
 
 
 def _refuse_failed(outcomes: list[Outcome]) -> None:

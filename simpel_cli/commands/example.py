@@ -1,0 +1,27 @@
+"""`simpel example DIR`: the folder of a rig, to be changed into one's own."""
+
+import shutil
+from pathlib import Path
+
+from simpel_cli.console import Terminal
+from simpel_cli.errors import ConfigError
+from simpel_cli.run import make_directory
+
+SOURCE = Path(__file__).parents[1] / "example"
+
+
+def example(folder: Path) -> None:
+    """Write the example into a folder that is new or empty.
+
+    Raises:
+        ConfigError: the folder has something in it, or cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"{folder}: is there and not empty. Name a new folder, or an empty one; nothing was changed.")
+    make_directory(folder, "DIR")
+    shutil.copytree(SOURCE, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+    terminal = Terminal(quiet=False)
+    terminal.line(f"{folder}/README.md says what is what", "written")
+    terminal.line(f"simpel sims cart --config-dir {folder}          # is that the simulator you meant?", "next")
+    terminal.line(f"simpel fit --config-dir {folder} experiment=cart")
+    terminal.line(f"simpel discover --config-dir {folder} experiment=cart    # what does it lack?")
