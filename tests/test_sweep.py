@@ -19,7 +19,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.run import is_locked, locked
 
 # long enough to be killed amid it; the same job several times, so that each says what the others should have come to
-LONG = ("experiment=pendulum", *TINY, "method.steps=6000", "run.quiet=false")
+LONG = ("experiment=pendulum", *TINY, "method.steps=3000", "run.quiet=false")
 SAME = (*LONG, "run.name=a,b", "hydra.sweep.dir=sweep", "hydra.launcher.workers=1")
 
 
