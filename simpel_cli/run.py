@@ -152,6 +152,7 @@ class Manifest:
     inputs: dict[str, str] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
+    _before: float = 0.0  # s of a run that is gone on with, until it was stopped; those until a kill nobody has written down
     _lock: Any = None
 
     def write(self, status: str, error: str | None = None) -> None:
@@ -177,8 +178,8 @@ class Manifest:
 
     @property
     def wall_seconds(self) -> float:
-        """Time since the start."""
-        return time.monotonic() - self.started
+        """Time at work, with that before a resume."""
+        return self._before + time.monotonic() - self.started
 
     def add_inputs(self, files: "tuple[Path, ...]") -> None:
         """Record the SHA-256 of input files."""
@@ -187,6 +188,9 @@ class Manifest:
     def __enter__(self) -> "Manifest":
         self._lock = locked(self.directory)
         try:
+            if (self.directory / "manifest.json").exists():
+                seconds = read_manifest(self.directory).get("wall_seconds")
+                self._before = float(seconds) if isinstance(seconds, int | float) else 0.0
             self.write("running")
         except BaseException:
             self._lock.close()

@@ -105,6 +105,7 @@ def test_interrupted_while_the_report_is_written(uninterrupted: Path, tmp_path: 
     assert metrics(run) == metrics(uninterrupted)
     assert state(run) == state(uninterrupted)
     assert (run / "report.html").exists()
+    assert json.loads((run / "manifest.json").read_text())["wall_seconds"] > record["wall_seconds"]  # of both
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])

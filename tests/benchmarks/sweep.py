@@ -33,6 +33,7 @@ WORDS = (
     "method=simpel,fsvgd",
     "data.n_train=10,20,40,80",
     "run.seed=0,1,2,3,4,5",
+    "method.steps=1000",
     "run.figures=false",
 )
 SIMPEL = (sys.executable, "-m", "simpel_cli.main")
