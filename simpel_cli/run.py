@@ -152,7 +152,9 @@ class Manifest:
     inputs: dict[str, str] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
-    _before: float = 0.0  # s of a run that is gone on with, until it was stopped; those until a kill nobody has written down
+    _before: float = (
+        0.0  # s of a run that is gone on with, until it was stopped; those until a kill nobody has written down
+    )
     _lock: Any = None
 
     def write(self, status: str, error: str | None = None) -> None:

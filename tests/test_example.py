@@ -26,6 +26,13 @@ def test_it_is_whole_and_nothing_is_overwritten(my: Path) -> None:
     assert (my / "sim" / "cart.yaml").read_text() == "mine"
 
 
+def test_what_comes_next_can_be_pasted(tmp_path: Path) -> None:
+    result = simpel(tmp_path, "example", "my rig")
+    next_ = [line.split("simpel ")[1].partition("#")[0] for line in result.out.splitlines() if "simpel " in line]
+    assert len(next_) == 3
+    assert all(shlex.split(words)[2 if "sims" in words else 1 :][:2] == ["--config-dir", "my rig"] for words in next_)
+
+
 def test_every_command_of_its_readme_composes(my: Path) -> None:
     commands = re.findall(r"^    simpel (\S+ .*?)(?:  +#.*)?$", (my / "README.md").read_text(), re.MULTILINE)
     assert len(commands) == 7

@@ -1,5 +1,6 @@
 """`simpel example DIR`: the folder of a rig, to be changed into one's own."""
 
+import shlex
 import shutil
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def example(folder: Path) -> None:
     shutil.copytree(SOURCE, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     terminal = Terminal(quiet=False)
     terminal.line(f"{folder}/README.md says what is what", "written")
-    terminal.line(f"simpel sims cart --config-dir {folder}          # is that the simulator you meant?", "next")
-    terminal.line(f"simpel fit --config-dir {folder} experiment=cart")
-    terminal.line(f"simpel discover --config-dir {folder} experiment=cart    # what does it lack?")
+    given = f"--config-dir {shlex.quote(str(folder))}"
+    terminal.line(f"simpel sims cart {given}          # is that the simulator you meant?", "next")
+    terminal.line(f"{'':10}simpel fit {given} experiment=cart")
+    terminal.line(f"{'':10}simpel discover {given} experiment=cart    # what does it lack?")
