@@ -100,7 +100,8 @@ def campaign(out: Path, every: int, seed: int, number: int = signal.SIGKILL, nam
                 row.lose(f"try {i}: {type(error).__name__}: {error}")
         rows.append(row)
         print(
-            f"{row.name}: {row.hit} of {row.tries} in time, {row.losses} losses, {row.tracebacks} tracebacks",
+            f"{row.name}: {row.hit} of {row.tries} in time, {row.losses} losses, {row.tracebacks} tracebacks, "
+            f"{row.exact} of {row.resumed} exact",
             flush=True,
         )
     return rows

@@ -65,8 +65,9 @@ def table(rows: Sequence[Row]) -> list[str]:
 def command(cwd: Path, words: Sequence[object], **options: object) -> subprocess.Popen[str]:
     """Start simpel as a process of its own, with a core of its own and a cache that campaigns share."""
     argv = [sys.executable, "-m", "simpel_cli.main", *map(str, words)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(argv, cwd=cwd, env=os.environ | {"PYTHONWARNINGS": "default"}, **(pipes | options))
+    pipes: dict[str, object] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    pipes["env"] = os.environ | {"PYTHONWARNINGS": "default"}
+    return subprocess.Popen(argv, cwd=cwd, **(pipes | options))
 
 
 def finish(child: subprocess.Popen[str]) -> tuple[int, str, str]:
