@@ -4,6 +4,7 @@ Finite particles come out narrower than the posterior by a known margin (LEARNIN
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from simpel_cli.nets import MLP
 from simpel_cli.prior import GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 
+OPTIMISED = {"xla_backend_optimization_level": 1}  # `make test` asks for 0, with which a step takes four times as long
 LENGTHSCALE, WHITE, NOISE, EDGE = 0.6, 1e-4, 0.1, 1.7
 X = np.array([-1.2, -0.9, -0.3, 0.4, 0.5, 1.3])
 Y = np.sin(2 * X) + NOISE * np.random.default_rng(0).standard_normal(6)
@@ -50,6 +52,15 @@ def exact(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     train, test = k(X, X) + WHITE * np.eye(len(X)), k(grid, grid) + WHITE * np.eye(len(grid))
     mean, covariance = oracles.gp_posterior(train, k(grid, X), test, Y, NOISE)
     return mean, np.sqrt(np.diag(covariance))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optimised() -> Iterator[None]:
+    """Long fits of small programs: worth a longer compilation."""
+    with pytest.MonkeyPatch.context() as patch:
+        compile_ = jax.stages.Lowered.compile
+        patch.setattr(jax.stages.Lowered, "compile", lambda lowered: compile_(lowered, compiler_options=OPTIMISED))
+        yield
 
 
 class Fitted(NamedTuple):
