@@ -64,7 +64,7 @@ bench: install ## Measure scores of every method, and speed of every estimator, 
 	$(BIN)/python -m tests.benchmarks.reference
 	$(BIN)/python -m tests.benchmarks.speed estimators
 
-torture: install ## Kill, starve and mislead every verb (KILLS=60 MUTATIONS=500 SEED=0 OUT=DIR); about two hours
+torture: install ## Kill, starve and mislead every verb (KILLS=60 MUTATIONS=500 SEED=1 OUT=DIR); about two hours
 	$(BIN)/python -m tests.torture --kills $(KILLS) --mutations $(MUTATIONS) --seed $(SEED) --out $(OUT)
 
 sbc: install ## Calibrate the inference of an experiment on functions of its own prior (WORDS="experiment=pendulum method=fsvgd")
