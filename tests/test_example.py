@@ -1,5 +1,6 @@
 """`simpel example`: the folder that a user begins with does what its README says."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -61,9 +62,10 @@ def test_launcher_of_its_own(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_friction_is_found(my: Path) -> None:
-    import json
-
     result = simpel(my, "discover", "--config-dir", ".", "experiment=cart", "close=false", "hydra.run.dir=found")
     assert result.code == 0, result.err
     verdict = json.loads((my / "found" / "verdict.json").read_text())
-    assert "coulomb_friction" in str(verdict["findings"])
+    assert (verdict["verdict"], [effect["name"] for effect in verdict["effects"]]) == ("effect", ["coulomb_friction"])
+    # of sim/cart_true.yaml: 1 N on 1.2 kg
+    assert verdict["effects"][0]["parameters"]["tau_c"]["value"] == pytest.approx(1 / 1.2, rel=0.02)
+    assert verdict["parameters"]["m"]["after"]["value"] == pytest.approx(1.2, rel=0.01)
