@@ -1,10 +1,12 @@
-"""Files of a run: metric rows as Parquet with one fixed schema, checkpoints as safetensors. Writes are atomic.
+"""Files of a run: metric rows as Parquet with one fixed schema, arrays as safetensors. Writes are atomic.
 
 A file appears under its name only when it is complete (temporary name in the same folder, fsync, rename), so a kill
-leaves the old one. Nothing that is loaded is ever unpickled.
+leaves the old one. Contents carry checksums: a disk or a copy that changed a bit is noticed, where it would else be read as
+another number. Nothing that is loaded is ever unpickled.
 """
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -63,12 +65,28 @@ def write_text(path: Path, text: str) -> None:
 def write_table(path: Path, columns: dict[str, Any], units: Mapping[str, str] | None = None) -> None:
     """Write columns (name -> sequence) as Parquet, atomically; units of columns become metadata of their fields."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     table = pa.Table.from_pydict(columns)
     fields = [f.with_metadata({"unit": units[f.name]}) if units and f.name in units else f for f in table.schema]
+    _write_parquet(path, table.cast(pa.schema(fields)))
+
+
+def _write_parquet(path: Path, table: Any) -> None:
+    import pyarrow.parquet as pq
+
     with replacing(path) as temporary:
-        pq.write_table(table.cast(pa.schema(fields)), temporary)
+        pq.write_table(table, temporary, write_page_checksum=True)
+
+
+def read_table(path: Path) -> Any:
+    """Read a Parquet file, of anybody's, as an Arrow table; where its pages have checksums, they are checked.
+
+    Raises:
+        OSError, pyarrow.ArrowException: it is missing or damaged.
+    """
+    import pyarrow.parquet as pq
+
+    return pq.read_table(path, page_checksum_verification=True)
 
 
 class MetricStream:
@@ -139,13 +157,11 @@ class MetricStream:
 def write_metrics(path: Path, rows: list[dict[str, Any]], constants: dict[str, Any]) -> Path:
     """Write metric rows as tidy Parquet with the fixed schema of every verb."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64()}
     schema = pa.schema([(name, types[kind]) for name, kind in COLUMNS])
     table = pa.table({n: pa.array([(constants | r).get(n) for r in rows], types[k]) for n, k in COLUMNS}, schema=schema)
-    with replacing(path) as temporary:
-        pq.write_table(table, temporary)
+    _write_parquet(path, table)
     return path
 
 
@@ -156,30 +172,19 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         ConfigError: the file is missing or damaged.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     try:
-        return pq.read_table(path).to_pylist()
+        return read_table(path).to_pylist()
     except (OSError, pa.ArrowException) as error:
         raise ConfigError(f"{path}: not readable as metrics ({str(error).splitlines()[0]}).") from error
 
 
 def save_checkpoint(directory: Path, leaves: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
     """Write `state.safetensors` and the JSON facts inside its header, as one atomic file."""
-    from safetensors import SafetensorError
-    from safetensors.numpy import save_file
-
     directory.mkdir(exist_ok=True)
     for stale in directory.glob(".*.tmp"):  # what a kill left of an earlier write
         stale.unlink(missing_ok=True)
-    with replacing(directory / "state.safetensors") as temporary:
-        contiguous = {name: np.ascontiguousarray(a) for name, a in leaves.items()}
-        try:
-            save_file(contiguous, temporary, metadata={"simpel": json.dumps(facts)})
-        except SafetensorError as error:
-            if found := re.search(r"os error (\d+)", str(error)):  # of the disk, not of what is written
-                raise OSError(int(found[1]), os.strerror(int(found[1])), str(directory)) from error
-            raise
+    write_arrays(directory / "state.safetensors", leaves, facts)
 
 
 def load_checkpoint(directory: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -188,16 +193,62 @@ def load_checkpoint(directory: Path) -> tuple[dict[str, np.ndarray], dict[str, A
     Raises:
         ConfigError: missing, truncated or not a checkpoint of simpel.
     """
-    from safetensors import SafetensorError, safe_open
-
     path = directory / "state.safetensors"
     if not path.is_file():
         raise ConfigError(f"{path}: no checkpoint. The run stopped before its first one; start it again.")
     try:
-        with safe_open(path, framework="np") as file:
-            facts = json.loads((file.metadata() or {})["simpel"])
-            return {name: file.get_tensor(name) for name in file.keys()}, facts  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        arrays, facts = read_arrays(path)
+        if not facts:
+            raise ValueError("it has no facts of a run")
+    except (OSError, ValueError) as error:
         raise ConfigError(
-            f"{path}: damaged or not a checkpoint of simpel ({type(error).__name__}: {error}). Restore it or fit again."
+            f"{path}: damaged or not a checkpoint of simpel ({error}). Restore it or fit again."
         ) from error
+    return arrays, facts
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+    """Write arrays as safetensors, atomically, with JSON facts and the SHA-256 of both in the header."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
+
+    contiguous = {name: np.asarray(a, order="C") for name, a in arrays.items()}
+    # under one key: safetensors writes several in any order, and the same results are to be the same bytes
+    header = {"simpel": json.dumps({**facts, "sha256": _digest(contiguous, facts)})}
+    with replacing(path) as temporary:
+        try:
+            save_file(contiguous, temporary, metadata=header)
+        except SafetensorError as error:
+            if found := re.search(r"os error (\d+)", str(error)):  # of the disk, not of what is written
+                raise OSError(int(found[1]), os.strerror(int(found[1])), str(path.parent)) from error
+            raise
+
+
+def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read arrays and facts of `write_arrays`.
+
+    Raises:
+        OSError: it cannot be opened.
+        ValueError: cut off, or changed since it was written.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            facts = json.loads((file.metadata() or {}).get("simpel", "{}"))
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            known = facts.pop("sha256", None)  # none in files of earlier versions
+    except (SafetensorError, AttributeError, TypeError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from error
+    if known is not None and known != _digest(arrays, facts):
+        raise ValueError("it is not what was written: the SHA-256 differs")
+    return arrays, facts
+
+
+def _digest(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of facts, and of every array's name, type, shape and values."""
+    digest = hashlib.sha256(json.dumps(facts).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

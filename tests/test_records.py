@@ -147,6 +147,7 @@ def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
     assert leaves.keys() == LEAVES.keys()
     for name, expected in LEAVES.items():
         assert leaves[name].dtype == expected.dtype
+        assert leaves[name].shape == expected.shape
         np.testing.assert_array_equal(leaves[name], expected)
 
 
@@ -165,6 +166,40 @@ def test_truncated_checkpoint_is_refused(tmp_path: Path, keep: int) -> None:
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ConfigError, match=r"state.safetensors: damaged or not a checkpoint of simpel .* fit again"):
         load_checkpoint(tmp_path)
+
+
+def test_a_checkpoint_of_which_any_byte_has_changed_is_refused(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, LEAVES, {"step": 500, "loss": 0.1})
+    path = tmp_path / "state.safetensors"
+    content = path.read_bytes()
+    for i in range(len(content)):
+        path.write_bytes(content[:i] + bytes([content[i] ^ 1]) + content[i + 1 :])
+        try:
+            leaves, facts = load_checkpoint(tmp_path)
+        except ConfigError:
+            continue
+        # what may be otherwise is how a header is written, and the sum's own name
+        assert facts.items() >= {"step": 500, "loss": 0.1}.items()
+        assert all(np.array_equal(leaves[name], expected) for name, expected in LEAVES.items())
+
+
+def test_a_checkpoint_of_an_earlier_version_has_no_sum(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    save_file({"w": np.ones(2)}, tmp_path / "state.safetensors", metadata={"simpel": json.dumps({"step": 3})})
+    leaves, facts = load_checkpoint(tmp_path)
+    assert (leaves["w"].tolist(), facts) == ([1, 1], {"step": 3})
+
+
+def test_a_table_of_which_a_value_has_changed_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.parquet"
+    values = np.random.default_rng(0).normal(size=50)  # nothing to compress
+    write_metrics(path, [{"metric": "nll", "value": value} for value in values], {})
+    content = path.read_bytes()
+    at = content.index(values[20:24].tobytes())
+    path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    with pytest.raises(ConfigError, match=r"metrics.parquet: not readable as metrics"):
+        read_metrics(path)
 
 
 def test_missing_checkpoint_is_named(tmp_path: Path) -> None:

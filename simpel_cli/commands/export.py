@@ -24,7 +24,7 @@ from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
 from simpel_cli.nodes import build
-from simpel_cli.records import load_checkpoint, replacing, write_text
+from simpel_cli.records import load_checkpoint, replacing, write_arrays, write_text
 from simpel_cli.run import Settings, make_directory, read_manifest
 from simulators.model import Model, ModelError
 
@@ -148,8 +148,6 @@ def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
 def _write_posterior(
     into: Path, folder: Path, config: dict[str, Any], source: Any, settings: Settings, index: int
 ) -> None:
-    from safetensors.numpy import save_file
-
     leaves, facts = load_checkpoint(folder / "checkpoint")
     root = next((root for root in NETWORKS if f"{root}.particles[0][0]" in leaves), None)
     if root is None:
@@ -185,8 +183,7 @@ def _write_posterior(
         "seed": settings.all_seeds[index],
         "step": facts.get("step"),
     }
-    with replacing(into / "posterior.safetensors") as temporary:
-        save_file({name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}, temporary)
+    write_arrays(into / "posterior.safetensors", {name: np.asarray(a, np.float32) for name, a in arrays.items()}, {})
     write_text(into / "posterior.json", json.dumps(told, indent=1))
     shutil.copyfile(Path(predictor.__file__), into / "predictor.py")
 

@@ -112,7 +112,7 @@ def read_sheet(path: Path) -> Sheet:
 
 def _read_parquet(path: Path) -> Sheet:
     try:
-        with parquet.ParquetFile(path) as file:
+        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             content = file.read()
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path.name} is damaged, cut off or no Parquet file. Copy or write it again.") from error

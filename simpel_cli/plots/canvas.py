@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.records import replacing
+from simpel_cli.records import read_table, replacing
 
 # colour-blind safe (Okabe and Ito 2008)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -83,9 +83,7 @@ def save(figure: Any, path: Path) -> Path:
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
     """Read a Parquet file as arrays by column."""
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
+    table = read_table(path)
     return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import DataError
+from simpel_cli.records import read_table
 from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Goal, Task
@@ -141,12 +142,10 @@ class Answers:
 
 def _table(path: Path) -> dict[str, np.ndarray]:
     """Read a Parquet file; one that is still being written is given a moment."""
-    import pyarrow.parquet as pq
-
     problem: Any = None
     for _ in range(25):
         try:
-            table = pq.read_table(path)
+            table = read_table(path)
             return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
         except (OSError, ValueError) as error:
             problem = error

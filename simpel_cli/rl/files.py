@@ -10,7 +10,7 @@ import numpy as np
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.records import replacing, write_text
+from simpel_cli.records import read_arrays, write_arrays, write_text
 from simpel_cli.rl import runner
 from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.task import Goal
@@ -40,14 +40,11 @@ def save_policy(folder: Path, policy: Policy, facts: dict[str, Any]) -> None:
         policy: one, not several.
         facts: its contract.
     """
-    from safetensors.numpy import save_file
-
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {"mean": policy.mean, "std": policy.std}
     for i, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel_{i}": kernel, f"bias_{i}": bias}
-    with replacing(folder / "policy.safetensors") as temporary:
-        save_file({name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}, temporary)
+    write_arrays(folder / "policy.safetensors", {name: np.asarray(a, np.float32) for name, a in arrays.items()}, {})
     write_text(folder / "policy.json", json.dumps(facts, indent=1))
     shutil.copyfile(Path(runner.__file__), folder / "run_policy.py")
 
@@ -58,15 +55,12 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     Raises:
         ConfigError: it is missing or damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     try:
         facts = json.loads((folder / "policy.json").read_text())
-        arrays = {name: jnp.asarray(a) for name, a in load_file(folder / "policy.safetensors").items()}
+        arrays = {name: jnp.asarray(a) for name, a in read_arrays(folder / "policy.safetensors")[0].items()}
         layers = tuple(
             (arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(sum(n.startswith("kernel_") for n in arrays))
         )
         return Policy(layers, arrays["mean"], arrays["std"]), facts
-    except (OSError, KeyError, ValueError, SafetensorError) as error:
+    except (OSError, KeyError, ValueError) as error:
         raise ConfigError(f"{folder}: holds no policy ({type(error).__name__}: {error}).") from error
