@@ -131,7 +131,7 @@ def _tried(row: Row, verb: Verb, folder: Path, reference: Path, after: float, nu
         code, _, err = finish(child)
     row.look(err, f"after {after:.2f} s")
     row.hit += code not in (0, 1)
-    if number == signal.SIGINT and code not in (0, 130):
+    if number == signal.SIGINT and code not in (0, 130, -number):  # a shell says 130 of both
         row.lose(f"Ctrl-C after {after:.2f} s: exit code {code}: {err.strip()[-200:]}")
     for problem in half_written(folder):
         row.lose(f"after {after:.2f} s: {problem}")
