@@ -20,11 +20,11 @@ def never_lost() -> Iterator[None]:
 
     Python drops what is raised there, and prints a traceback. JAX has such a callback: one Ctrl-C in eight was lost to it.
     """
-    before = sys.unraisablehook
+    before, main = sys.unraisablehook, threading.main_thread().ident or 0
 
     def once_more() -> None:
         time.sleep(0.01)  # s; by then the callback has returned
-        _thread.interrupt_main()
+        signal.pthread_kill(main, signal.SIGINT)  # a real signal: it ends a blocking call, too
 
     def hook(dropped: Any) -> None:
         if dropped.exc_type is KeyboardInterrupt:
