@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from command_line import simpel
 
-from simpel_cli.evaluation.comparison import Mean, best, difference, mean
+from simpel_cli.evaluation.comparison import Mean, Metric, best, difference, mean
 from simpel_cli.records import write_metrics, write_table
 
 SIZES, SEEDS = (10, 40), (0, 1, 2)
@@ -53,6 +53,14 @@ def test_intervals_are_student_s() -> None:
     assert mean([3.0, 3.1]).certain
 
 
+def test_an_interval_of_shares_ends_where_shares_do() -> None:
+    coverage = Metric("coverage_90", "", 0, 0, 1)
+    assert mean([0.9, 0.99]).high > 1
+    assert coverage.over([0.9, 0.99]) == mean([0.9, 0.99])._replace(high=1)
+    assert coverage.over([0.9, 0.91]) == mean([0.9, 0.91])
+    assert np.isnan(coverage.over([0.9]).low)
+
+
 def test_pairs_share_their_seeds() -> None:
     assert difference({0: 3.0, 1: 5.0, 7: 99.0}, {0: 2.0, 1: 4.0, 8: -99.0})[:3] == (1.0, 1.0, 1.0)
     assert np.isnan(difference({0: 1.0}, {1: 1.0}).value)
@@ -60,12 +68,12 @@ def test_pairs_share_their_seeds() -> None:
 
 def test_best() -> None:
     cells = {("a", 1): {0: 1.0, 1: 2.0}, ("b", 1): {0: 2.0, 1: 3.1}, ("c", 1): {0: float("nan")}, ("b", 2): {0: 1.0}}
-    low, alone = best(cells, -1)
+    low, alone = best(cells, Metric("nll", "", -1))
     assert (low.variant, low.second, alone.variant, alone.second) == ("a", "b", "b", "")
     assert low.lead.value == pytest.approx(1.05)
     assert isinstance(low.lead, Mean)
     assert low.lead.low < 1.05 < low.lead.high
-    high, _ = best(cells, 1)
+    high, _ = best(cells, Metric("return", "", 1))
     assert (high.variant, high.lead.value) == ("b", pytest.approx(1.05))
 
 

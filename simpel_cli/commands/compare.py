@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.commands.gather import Found
-from simpel_cli.evaluation.comparison import METRICS, Mean, Metric, best, by_seed, difference, mean, points, variant
+from simpel_cli.evaluation.comparison import METRICS, Mean, Metric, best, by_seed, difference, points, variant
 from simpel_cli.plots.canvas import columns_of, distinct, with_interval
 from simpel_cli.plots.compare import Course, draw_calibrations, draw_courses
 from simpel_cli.plots.sweep import draw_by_size
@@ -90,7 +90,7 @@ class Comparison:
         chosen = next((m for m in self.metrics if m.sign), None)
         if chosen is None or len({name for name, _ in self.cells[chosen.name]}) < 2:
             return []
-        last = best(self.cells[chosen.name], chosen.sign)[-1]
+        last = best(self.cells[chosen.name], chosen)[-1]
         size = f" at n = {last.size}" if last.size else ""
         if not last.second:
             return []
@@ -105,7 +105,7 @@ class Comparison:
     def _best(self, metric: Metric) -> dict[str, Any]:
         rows = [
             (_size(b.size), b.variant, _shown(b.score), b.second or "-", _shown(b.lead), _certain(b.lead))
-            for b in best(self.cells[metric.name], metric.sign)
+            for b in best(self.cells[metric.name], metric)
         ]
         head = ("transitions", "best", metric.label, "second", "lead", "")
         write_latex(self.out / "tables" / f"{self.slug}-best.tex", f"{self.name}: best configurations", head, rows)
@@ -118,7 +118,7 @@ class Comparison:
     def _means(self, metric: Metric) -> dict[str, Any]:
         cells, sizes = self.cells[metric.name], self._sizes()
         names = distinct(name for name, _ in cells)
-        means = {cell: mean(values.values()) for cell, values in cells.items()}
+        means = {cell: metric.over(values.values()) for cell, values in cells.items()}
         rows = [(name, *(_shown(means.get((name, n))) for n in sizes)) for name in names]
         head = ("", *map(_size, sizes))
         stem = self.out / "tables" / f"{self.slug}-{metric.name}"
@@ -137,7 +137,7 @@ class Comparison:
         names = distinct(name for name, _ in cells)
         if len(names) < 2:
             return []
-        base = best(cells, metric.sign)[-1].variant if self.baseline not in names else str(self.baseline)
+        base = best(cells, metric)[-1].variant if self.baseline not in names else str(self.baseline)
         found = {
             (name, n): difference(cells[name, n], cells[base, n])
             for name in names

@@ -21,27 +21,36 @@ class Metric(NamedTuple):
         name: in `metrics.parquet`.
         label: in tables and figures.
         sign: 1 where more is better, -1 where less is, 0 where neither.
+        least, most: that there can be.
     """
 
     name: str
     label: str
     sign: int
+    least: float = -np.inf
+    most: float = np.inf
+
+    def over(self, seeds: Iterable[float]) -> "Mean":
+        """Return the mean of one value per seed; its interval ends where there can be nothing."""
+        found = mean(seeds)
+        low, high = np.clip((found.low, found.high), self.least, self.most)
+        return found._replace(low=float(low), high=float(high))
 
 
 METRICS = {  # verb -> the first is the one that the best is chosen by
     "fit": (
         Metric("nll", "test NLL [nat]", -1),
         Metric("nrmse", "test RMSE, normalised", -1),
-        Metric("coverage_90", "targets inside the 90 % region", 0),
+        Metric("coverage_90", "targets inside the 90 % region", 0, 0, 1),
     ),
     "rl-offline": (
         Metric("return_in_truth", "return in the truth", 1),
-        Metric("success", "episodes that succeed", 1),
+        Metric("success", "episodes that succeed", 1, 0, 1),
         Metric("return_in_model", "return in the model", 0),
     ),
     "rl-online": (
         Metric("return", "return, mean of all episodes", 1),
-        Metric("success", "episodes that succeed", 1),
+        Metric("success", "episodes that succeed", 1, 0, 1),
     ),
 }
 METRICS |= {"evaluate": METRICS["fit"], "discover": METRICS["fit"]}
@@ -162,15 +171,17 @@ class Best(NamedTuple):
     lead: Mean
 
 
-def best(cells: dict[tuple[str, int], dict[int, float]], sign: int) -> list[Best]:
+def best(cells: dict[tuple[str, int], dict[int, float]], metric: Metric) -> list[Best]:
     """Return the best variant of every size, and its lead."""
     found = []
     for size in sorted({size for _, size in cells}):
-        scores = {name: mean(seeds.values()) for (name, n), seeds in cells.items() if n == size}
-        order = sorted(scores, key=lambda name: (not np.isfinite(scores[name].value), -sign * scores[name].value))
+        scores = {name: metric.over(seeds.values()) for (name, n), seeds in cells.items() if n == size}
+        order = sorted(
+            scores, key=lambda name: (not np.isfinite(scores[name].value), -metric.sign * scores[name].value)
+        )
         second = order[1] if len(order) > 1 else ""
         lead = difference(cells[order[0], size], cells[second, size]) if second else mean([])
-        if sign < 0:
+        if metric.sign < 0:
             lead = Mean(-lead.value, -lead.high, -lead.low, lead.seeds)
         found.append(Best(size, order[0], scores[order[0]], second, lead))
     return found
