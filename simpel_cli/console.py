@@ -5,12 +5,25 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.text import Text
+
+_silent = ContextVar("_silent", default=False)
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Print nothing meanwhile: of a worker's job its sweep speaks. It is no setting of the run, which may be shown later."""
+    token = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(token)
 
 
 class _Screen(Console):
@@ -37,7 +50,7 @@ class Terminal:
     def __init__(self, quiet: bool, log: Path | None = None) -> None:
         # a wide console when the output is a file or a pipe: lines are for grep, not for wrapping
         wide = sys.stdout is None or not sys.stdout.isatty()  # None: closed before the start (`simpel fit >&-`)
-        self.console = _Screen(quiet=quiet, highlight=False, width=240 if wide else None)
+        self.console = _Screen(quiet=quiet or _silent.get(), highlight=False, width=240 if wide else None)
         self.log = log
 
     def line(self, text: str = "", label: str = "", style: str = "") -> None:
@@ -50,6 +63,11 @@ class Terminal:
             now = datetime.now()
             with self.log.open("a") as file:
                 file.write(f"{now:%Y-%m-%d %H:%M:%S},{now.microsecond // 1000:03d} {shown}\n")
+
+    def next(self, commands: Sequence[str]) -> None:
+        """Print commands to go on with, one a line."""
+        for i, command in enumerate(commands):
+            self.line(f"{'' if i == 0 else ' ' * 10}{command}", "" if i else "next")
 
     @contextmanager
     def progress(self, label: str, total: int, start: int) -> Iterator[Any]:

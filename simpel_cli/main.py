@@ -245,7 +245,7 @@ def sweep(
 @app.command()
 def report(
     directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Runs, sweeps, or folders of them.")],
-    out: Annotated[Path | None, typer.Option(help="Folder of the report.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Left out: the sweep itself, else a folder in runs/report.")] = None,
     baseline: Annotated[str | None, typer.Option(help="Method that the others are compared with.")] = None,
 ) -> None:
     """Compare runs and sweeps: one HTML file, LaTeX and CSV tables.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
@@ -120,6 +121,11 @@ def stream(seed: int, name: str) -> "PRNGKeyArray":
     import jax
 
     return jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode()))
+
+
+def typed(path: Path | str) -> str:
+    """Return a path as a shell reads it: in quotes where it has blanks."""
+    return quote(str(path))
 
 
 def sha256(path: Path) -> str:
@@ -299,7 +305,7 @@ def refuse_occupied(directory: Path, key: str = "hydra.run.dir") -> None:
     if record.get("status") == "failed" and not any(any(directory.rglob(name)) for name in COMPUTED):
         return
     verb = record["command"]
-    go_on = f"Go on with `simpel {verb} --resume {directory}`, or choose" if verb in RESUMED else "Choose"
+    go_on = f"Go on with `simpel {verb} --resume {typed(directory)}`, or choose" if verb in RESUMED else "Choose"
     raise ConfigError(f"{key}: {directory} holds a run already. {go_on} another directory; nothing was changed.")
 
 

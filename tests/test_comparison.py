@@ -12,7 +12,7 @@ import pytest
 from command_line import simpel
 
 from simpel_cli.evaluation.comparison import Mean, Metric, best, difference, mean
-from simpel_cli.records import write_metrics, write_table
+from simpel_cli.records import read_metrics, write_metrics, write_table
 
 SIZES, SEEDS = (10, 40), (0, 1, 2)
 LEVEL = {("simpel", 10): -8.0, ("simpel", 40): -9.0, ("fsvgd", 10): 20.0, ("fsvgd", 40): -8.9}
@@ -78,7 +78,7 @@ def test_best() -> None:
 
 
 def test_report_of_parquet_files(runs: Path, tmp_path: Path) -> None:
-    result = simpel(tmp_path, "report", "fits")
+    result = simpel(tmp_path, "report", "fits", "--out", "fits")
     assert (result.code, result.err) == (0, "")
     # 0.1 apart in every seed: certain in pairs, though the seeds differ by 0.5
     assert "pend_ulum: simpel has the best test NLL [nat] at n = 40, ahead of fsvgd by 0.1" in result.out
@@ -112,6 +112,7 @@ def test_report_of_parquet_files(runs: Path, tmp_path: Path) -> None:
             "--baseline: got simple, which no run is of. Did you mean simpel?",
         ),
         (("report", "fits", "--out", "file"), "--out: cannot write to file"),
+        (("report", "fits", "--out", "fits/broken"), "--out: fits/broken is the directory of a run"),
     ],
 )
 def test_wrong_reports(runs: Path, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
@@ -122,10 +123,35 @@ def test_wrong_reports(runs: Path, tmp_path: Path, words: tuple[str, ...], messa
     assert message in result.err
 
 
+def test_a_folder_of_runs_is_left_as_it_is(runs: Path, tmp_path: Path) -> None:
+    before = sorted(runs.iterdir())
+    (runs / "report.html").write_text("mine")
+    result = simpel(tmp_path, "report", "fits")
+    (written,) = (tmp_path / "runs" / "report").glob("*/report.html")
+    assert f"report    {written.relative_to(tmp_path)}" in result.out
+    assert (runs / "report.html").read_text() == "mine"
+    assert sorted(p for p in runs.iterdir() if p.name != "report.html") == before
+
+
+def test_only_words_that_tell_runs_of_one_panel_apart_are_in_their_names(runs: Path, tmp_path: Path) -> None:
+    for i, folder in enumerate(sorted(runs.glob("*-10-*"))):
+        (folder / ".hydra").mkdir()
+        words = ["score=kde", f"prior.draws={64 * (1 + i % 2)}"]
+        (folder / ".hydra" / "overrides.yaml").write_text(json.dumps(words))
+        if i % 2:  # of another experiment, all alike
+            rows = [r | {"experiment": "cart"} for r in read_metrics(folder / "metrics.parquet")]
+            write_metrics(folder / "metrics.parquet", rows, {})
+    for folder in runs.glob("*-40-*"):
+        shutil.rmtree(folder)
+    assert simpel(tmp_path, "report", "fits", "--out", "there").code == 0
+    page = (tmp_path / "there" / "report.html").read_text()
+    assert ("score=kde" in page, "prior.draws" in page) == (False, False)
+
+
 def test_a_damaged_run_costs_itself_only(runs: Path, tmp_path: Path) -> None:
     (runs / "simpel-10-0" / "metrics.parquet").write_bytes(b"PAR1 and nothing else")
     (runs / "simpel-10-1" / "calibration.parquet").write_bytes(b"")
-    result = simpel(tmp_path, "report", "fits")
+    result = simpel(tmp_path, "report", "fits", "--out", "fits")
     assert result.code == 0
     page = (runs / "report.html").read_text()
     assert "done, metrics not readable" in page
@@ -143,7 +169,7 @@ def test_report_in_a_browser(runs: Path, tmp_path: Path) -> None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         pytest.skip("no Chromium here")
-    assert simpel(tmp_path, "report", "fits").code == 0
+    assert simpel(tmp_path, "report", "fits", "--out", "fits").code == 0
     page = tmp_path / "page.html"
     page.write_text((runs / "report.html").read_text().replace("</head>", LOOK + "</head>"))
     words = [

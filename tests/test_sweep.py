@@ -143,6 +143,9 @@ def test_another_launcher_of_hydra_runs_the_same_jobs(tmp_path: Path) -> None:
     assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]
     table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
     assert {row["run"] for row in table} == {"method.learning_rate=0.001"}
+    # a job is silent, its run is not: it can be looked at later
+    assert simpel(tmp_path, "fit", "--resume", "sweep/0").out.endswith("is complete; nothing to do.\n")
+    assert "NLL" in simpel(tmp_path, "evaluate", "sweep/0").out
     # what was done with one configuration is not taken for the outcome of another
     record = json.loads((tmp_path / "sweep" / "sweep.json").read_text())
     record["words"] = [*words[:-1], "method.learning_rate=0.002,0.003"]

@@ -11,6 +11,7 @@ from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.plots import draw_sweep
 from simpel_cli.records import read_metrics, write_metrics, write_text
+from simpel_cli.run import typed
 
 RECORD = "sweep.json"
 HEADLINES = {  # metric -> what it is called in a line
@@ -75,7 +76,7 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> list[Found]:
     if left:
         shown = ", ".join(job.directory.name for job in left[:10])
         shown += f" and {len(left) - 10} more" if len(left) > 10 else ""
-        terminal.line(f"not done: {shown}; `simpel sweep --resume {root}` runs them")
+        terminal.line(f"not done: {shown}; `simpel sweep --resume {typed(root)}` runs them")
     if not rows:
         return left
     path = write_metrics(root / "sweep.parquet", rows, {})
@@ -84,7 +85,7 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> list[Found]:
     figure = draw_sweep(path)
     if figure is not None:
         terminal.line(str(figure), "figure")
-    terminal.line(f"simpel report {root}", "next")
+    terminal.next([f"simpel report {typed(root)}"])
     return left
 
 

@@ -30,7 +30,7 @@ class Run(NamedTuple):
     Args:
         found: where it is.
         rows: of its metrics.
-        words: its overrides, less those that all runs share.
+        words: its overrides, less those that all runs of its panel share.
         facts: of its manifest; empty where there is none.
     """
 

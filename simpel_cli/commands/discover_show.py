@@ -11,6 +11,7 @@ from simpel_cli.console import Terminal
 from simpel_cli.discovery.unseen import in_words
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import write_report
+from simpel_cli.run import typed
 
 KINDS = {
     "effect": "An effect was found.",
@@ -37,8 +38,7 @@ def publish(terminal: Terminal, found: dict[str, Any], directory: Path, config: 
     drawn = config.get("report", True)
     path = _reported(found, directory, config, commands) if drawn else directory / "verdict.json"
     terminal.line(str(path), "report" if drawn else "verdict")
-    for label, line in zip(["next", *[""] * len(commands)], commands, strict=False):
-        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    terminal.next(commands)
     return path
 
 
@@ -100,7 +100,7 @@ def _number(value: float) -> str:
 def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]) -> list[str]:
     """Return commands to go on with, as they can be typed where this one was."""
     chosen = config.get("choices") or {}
-    own = f" --config-dir {chosen['config_dir']}" if chosen.get("config_dir") else ""
+    own = f" --config-dir {typed(chosen['config_dir'])}" if chosen.get("config_dir") else ""
     what = (
         f"experiment={chosen['experiment']}"
         if chosen.get("experiment")
@@ -110,7 +110,9 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
     if found["corrected_sim"] and found["effects"]:
         name = Path(found["corrected_sim"]).stem
         past = f" data.stack_actions={found['stack_actions']}" if found.get("stack_actions") else ""
-        lines.append(f"simpel fit --config-dir {directory / 'conf'} sim={name} data={chosen.get('data', '')}{past}")
+        lines.append(
+            f"simpel fit --config-dir {typed(directory / 'conf')} sim={name} data={chosen.get('data', '')}{past}"
+        )
     lines.append(f"simpel fit{own} {what}          # with the simulator as it is")
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")

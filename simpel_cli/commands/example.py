@@ -1,12 +1,11 @@
 """`simpel example DIR`: the folder of a rig, to be changed into one's own."""
 
-import shlex
 import shutil
 from pathlib import Path
 
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
-from simpel_cli.run import make_directory
+from simpel_cli.run import make_directory, typed
 
 SOURCE = Path(__file__).parents[1] / "example"
 
@@ -23,7 +22,11 @@ def example(folder: Path) -> None:
     shutil.copytree(SOURCE, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     terminal = Terminal(quiet=False)
     terminal.line(f"{folder}/README.md says what is what", "written")
-    given = f"--config-dir {shlex.quote(str(folder))}"
-    terminal.line(f"simpel sims cart {given}          # is that the simulator you meant?", "next")
-    terminal.line(f"{'':10}simpel fit {given} experiment=cart")
-    terminal.line(f"{'':10}simpel discover {given} experiment=cart    # what does it lack?")
+    given = f"--config-dir {typed(folder)}"
+    terminal.next(
+        (
+            f"simpel sims cart {given}          # is that the simulator you meant?",
+            f"simpel fit {given} experiment=cart",
+            f"simpel discover {given} experiment=cart    # what does it lack?",
+        )
+    )

@@ -25,7 +25,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
 from simpel_cli.nodes import build
 from simpel_cli.records import load_checkpoint, replacing, write_arrays, write_text
-from simpel_cli.run import Settings, make_directory, read_manifest
+from simpel_cli.run import Settings, make_directory, read_manifest, typed
 from simulators.model import Model, ModelError
 
 VERBS = {"fit": ".", "discover": ".", "rl-offline": "posterior"}
@@ -51,7 +51,9 @@ def export(run: Path, out: Path | None = None, seed: int | None = None) -> None:
             "has one, rounds/NNN/posterior."
         )
     if record.get("status") != "done":
-        raise ConfigError(f"{run}: {record.get('status')}, not done. Go on with it first: simpel {verb} --resume {run}")
+        raise ConfigError(
+            f"{run}: {record.get('status')}, not done. Go on with it first: simpel {verb} --resume {typed(run)}"
+        )
     folder = run / VERBS[verb]
     config = load(folder / "config.yaml")
     settings = build(config.get("run") or {}, "run", default=Settings)

@@ -18,7 +18,15 @@ from simpel_cli.config import Job, dump, load
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.records import MetricStream, write_table, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_changed_config, refuse_occupied, sha256
+from simpel_cli.run import (
+    Manifest,
+    make_directory,
+    read_manifest,
+    refuse_changed_config,
+    refuse_occupied,
+    sha256,
+    typed,
+)
 from simpel_cli.tensorboard import Scalars
 
 LOG_EVERY = 50  # steps per row of the metric table
@@ -112,7 +120,7 @@ def _run(
         if not study.recording.test:
             metrics.close()
             terminal.line(
-                f"nothing was kept to judge on; simpel evaluate {directory} data=NAME judges on other measurements"
+                f"nothing was kept to judge on; simpel evaluate {typed(directory)} data=NAME judges on other measurements"
             )
             return Learned(study, fitted, state)
         found = posteriors(study, fitted, state)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from simpel_cli.commands.gather import ASIDE
 from simpel_cli.config import Job, load
+from simpel_cli.console import silence
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.run import RESUMED, is_locked, read_manifest
@@ -62,17 +63,16 @@ def perform(job: Job, stop: threading.Event | None = None) -> Outcome:
         stop: set by whoever wants it to save its state and end.
     """
     began = perf_counter()
-    quiet = job._replace(config=job.config | {"run": (job.config.get("run") or {}) | {"quiet": True}})
     code, error, resumed = 0, "", False
     try:
-        with _one_at_a_time, interruption(stop) as stopped:
+        with _one_at_a_time, silence(), interruption(stop) as stopped:
             while is_locked(job.directory):  # by a worker that an earlier client of the cluster has left behind
                 stop_if(stopped)
                 sleep(1.0)
             if (before := complete(job)) is not None:
                 return before
             resumed = _begun(job)
-            _runner(job.verb, resumed)(job.directory if resumed else quiet)
+            _runner(job.verb, resumed)(job.directory if resumed else job)
     except SimpelError as failure:
         code, error = failure.exit_code, str(failure)
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
 from simpel_cli.plots.canvas import distinct
 from simpel_cli.records import read_metrics
 from simpel_cli.report import write_report
-from simpel_cli.run import make_directory, read_manifest
+from simpel_cli.run import make_directory, read_manifest, typed
 from simpel_cli.tables import write_csv, write_latex
 
 NAMED = 20  # of the runs that are not done
@@ -45,6 +45,8 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
         raise ConfigError(
             f"--baseline: got {baseline}, which no run is of.{did_you_mean(baseline, names)} (there are {', '.join(names)})"
         )
+    if (out / "manifest.json").exists():
+        raise ConfigError(f"--out: {out} is the directory of a run, which has a report of its own. Name another one.")
     make_directory(out, "--out")
     make_directory(out / "tables", "--out")
     sections: list[dict[str, Any]] = []
@@ -66,7 +68,9 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
         lead=lead,
         opening=" ".join(leads),
         sections=sections,
-        commands=[f"simpel report {' '.join(map(str, roots))}{f' --baseline {baseline!r}' if baseline else ''}"],
+        commands=[
+            f"simpel report {' '.join(typed(root) for root in roots)}{f' --baseline {typed(baseline)}' if baseline else ''}"
+        ],
     )
     for line in leads:
         terminal.line(line)
@@ -76,8 +80,8 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
 
 
 def default_folder(roots: Sequence[Path]) -> Path:
-    """Return where the report goes: a sweep or a folder of runs has room for one, a run has one of its own."""
-    if len(roots) == 1 and not any((roots[0] / mark).exists() for mark in ("manifest.json", "metrics.parquet")):
+    """Return where the report goes: a sweep has room for one; a run has a report of its own, a folder may hold anything."""
+    if len(roots) == 1 and any((roots[0] / mark).exists() for mark in ("sweep.json", "sweep.parquet")):
         return roots[0]
     return Path("runs") / "report" / f"{datetime.now():%Y%m%d-%H%M%S}"
 
@@ -95,29 +99,35 @@ def _below(root: Path) -> list[Found]:
 
 def _read(found: Sequence[Found]) -> tuple[list[Run], list[Found]]:
     """Return the runs that are done, and those whose metrics cannot be read."""
-    done = [each for each in found if each.status == "done"]
-    shared = set.intersection(*(set(each.words) for each in done)) if done else set()
     runs, unread = [], []
-    for each in done:
-        try:
-            runs += _of(each, tuple(word for word in each.words if word not in shared))
-        except SimpelError:
-            unread.append(each)
+    for each in found:
+        if each.status == "done":
+            try:
+                runs += _of(each)
+            except SimpelError:
+                unread.append(each)
     if not runs:
         states = Counter(each.status or "not begun" for each in found)
         told = ", ".join(f"{count} {state}" for state, count in states.items())
         raise ConfigError(f"report: of {len(found)} runs none is done with metrics that can be read ({told}).")
-    return runs, unread
+    panels = distinct(run.panel for run in runs)
+    return [run for panel in panels for run in _apart([run for run in runs if run.panel == panel])], unread
 
 
-def _of(found: Found, words: tuple[str, ...]) -> list[Run]:
+def _apart(runs: Sequence[Run]) -> list[Run]:
+    """Return runs that are compared with each other, of whose words only those are left that tell them apart."""
+    shared = set.intersection(*(set(run.words) for run in runs))
+    return [run._replace(words=tuple(word for word in run.words if word not in shared)) for run in runs]
+
+
+def _of(found: Found) -> list[Run]:
     path = found.directory / "metrics.parquet"
     if path.is_file():
         rows = read_metrics(path)
         facts: dict[str, Any] = {}
         with contextlib.suppress(SimpelError):
             facts = read_manifest(found.directory)
-        return [Run(found, rows, words, facts)] if rows else []
+        return [Run(found, rows, found.words, facts)] if rows else []
     rows = read_metrics(found.directory / "sweep.parquet")
     return [
         Run(found, [r for r in rows if r["run"] == name], tuple(name.split()), {})

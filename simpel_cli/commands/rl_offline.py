@@ -37,6 +37,7 @@ from simpel_cli.run import (
     refuse_changed_config,
     refuse_occupied,
     stream,
+    typed,
 )
 from simpel_cli.tensorboard import Scalars
 
@@ -244,10 +245,11 @@ def _publish(
         if share:
             terminal.line(f"seed {seed}: {100 * share:.0f} % of the roll-outs in the model diverged", "diverged")
     images = draw_control(directory) if study.settings.figures else []
-    run = f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # a JSON object per line; no JAX needed"
+    runner = typed(directory / "policy" / "run_policy.py")
+    run = f"python {runner} < states.jsonl          # a JSON object per line; no JAX needed"
     commands = [
         *([run] if flown.policies is not None else []),
-        f"simpel evaluate {directory / 'posterior'}          # the model that the policy was learned in",
+        f"simpel evaluate {typed(directory / 'posterior')}          # the model that the policy was learned in",
     ]
     note = (
         f"{asked.control.episodes} episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; intervals over "
@@ -273,5 +275,4 @@ def _publish(
         config=dump(config),
     )
     terminal.line(str(report), "report")
-    for label, line in zip(["next", ""], commands, strict=False):
-        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    terminal.next(commands)

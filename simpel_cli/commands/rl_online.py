@@ -41,6 +41,7 @@ from simpel_cli.run import (
     refuse_changed_config,
     refuse_occupied,
     stream,
+    typed,
 )
 from simpel_cli.tensorboard import Scalars
 from simulators.model import Model
@@ -464,9 +465,9 @@ def _publish(loop: Loop) -> None:
         ))  # fmt: skip
     images = draw_online(directory) if loop.settings.figures else []
     commands = [
-        f"python {directory / 'policy' / 'run_policy.py'} < states.jsonl          # the last policy; no JAX needed",
-        f"simpel rl-online --resume {directory} online.episodes={2 * loop.online.episodes}          # more of them",
-        f"simpel evaluate {_folder(loop, last) / 'posterior'} data=NAME          # the last model, on measurements of yours",
+        f"python {typed(directory / 'policy' / 'run_policy.py')} < states.jsonl          # the last policy; no JAX needed",
+        f"simpel rl-online --resume {typed(directory)} online.episodes={2 * loop.online.episodes}          # more of them",
+        f"simpel evaluate {typed(_folder(loop, last) / 'posterior')} data=NAME          # the last model, on a file of yours",
     ]
     report = write_report(
         directory / "report.html",
@@ -482,5 +483,4 @@ def _publish(loop: Loop) -> None:
         config=dump(loop.config),
     )
     loop.terminal.line(str(report), "report")
-    for label, line in zip(["next", "", ""], commands, strict=True):
-        loop.terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    loop.terminal.next(commands)

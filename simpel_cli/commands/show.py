@@ -17,6 +17,7 @@ from simpel_cli.inference import Method
 from simpel_cli.plots import draw_run
 from simpel_cli.prior_predictive import PriorCheck
 from simpel_cli.report import figure, write_report
+from simpel_cli.run import typed
 
 METRICS = {
     "nll": "NLL",
@@ -141,8 +142,7 @@ def publish(
         config=config,
     )
     terminal.line(str(report), "report")
-    for label, line in zip(["next", *[""] * len(next_commands)], next_commands, strict=False):
-        terminal.line(f"{'' if label else ' ' * 10}{line}", label)
+    terminal.next(next_commands)
 
 
 NO_INTERVAL = [float("nan")]  # of what is no mean over test points
@@ -220,7 +220,7 @@ def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
 def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     """Return commands to go on with, as they can be typed where this one was."""
     chosen = study.choices
-    own = f" --config-dir {chosen['config_dir']}" if chosen.get("config_dir") else ""
+    own = f" --config-dir {typed(chosen['config_dir'])}" if chosen.get("config_dir") else ""
     what = (
         f"experiment={chosen['experiment']}"
         if chosen.get("experiment")
@@ -229,6 +229,6 @@ def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {source or directory}          # with data=NAME: on all of a new file",
+        f"simpel evaluate {typed(source or directory)}          # with data=NAME: on all of a new file",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]

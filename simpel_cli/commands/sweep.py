@@ -18,7 +18,7 @@ from simpel_cli.console import Board, Terminal
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.interruption import interruption
 from simpel_cli.launcher import DaskLauncher
-from simpel_cli.run import locked
+from simpel_cli.run import locked, typed
 
 LOOK = 0.2  # s between two looks at what has ended
 GRACE = 300.0  # s that running jobs have to save their state
@@ -103,7 +103,7 @@ class Sweep:
         while self._cluster.running and perf_counter() < end:
             self.outcomes += self._cluster.ended(LOOK)
         raise Interrupted(
-            f"the sweep was stopped; finished jobs are kept. `simpel sweep --resume {self.root}` goes on."
+            f"the sweep was stopped; finished jobs are kept. `simpel sweep --resume {typed(self.root or 'DIR')}` goes on."
         )
 
     def _say(self, outcome: Outcome) -> None:
@@ -148,8 +148,8 @@ def sweep(verb: str, overrides: list[str], config_dir: Path | None, cfg: str | N
     given = value_of("hydra.sweep.dir", overrides)
     if given is not None and (Path(given) / RECORD).exists():
         raise ConfigError(
-            f"hydra.sweep.dir: {given} holds a sweep already. Go on with `simpel sweep --resume {given}`, or choose another "
-            "directory; nothing was changed."
+            f"hydra.sweep.dir: {given} holds a sweep already. Go on with `simpel sweep --resume {typed(given)}`, or choose "
+            "another directory; nothing was changed."
         )
     folder = str(config_dir.absolute()) if config_dir is not None else None
     _run(Record(verb, overrides, folder, count_jobs(overrides)), overrides)
