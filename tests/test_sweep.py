@@ -189,6 +189,26 @@ def test_two_sweeps_in_one_directory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        (
+            "",
+            "hydra.sweep.dir: . holds other runs (fits/a), which the sweep would take for its own. Choose another directory",
+        ),
+        ("fits", "hydra.sweep.dir: fits holds other runs (fits/a)"),
+        ("file", "hydra.sweep.dir: file is a file. Choose another directory"),
+    ],
+)
+def test_a_directory_that_will_not_do(tmp_path: Path, given: str, message: str) -> None:
+    (tmp_path / "fits" / "a").mkdir(parents=True)
+    (tmp_path / "fits" / "a" / "metrics.parquet").touch()
+    (tmp_path / "file").touch()
+    result = simpel(tmp_path, "sweep", "experiment=pendulum", *TINY, "run.seed=0,1", f"hydra.sweep.dir='{given}'")
+    assert (result.code, message in result.err) == (2, True), result.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "fits"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
         ({"workers": 0}, "hydra.launcher.workers: got 0; allowed are 1 to 1000, and null."),
         ({"address": "cluster"}, "hydra.launcher.address: got cluster; it looks like tcp://HOST:PORT."),
         ({"worker": 2}, "hydra.launcher.worker: no such key. Did you mean workers?"),

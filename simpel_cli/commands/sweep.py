@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
-from simpel_cli.commands.gather import Found
+from simpel_cli.commands.gather import Found, runs_below
 from simpel_cli.commands.job import Outcome, perform
 from simpel_cli.config import Job, count_jobs, first_job, launch, sweep_directory, value_of
 from simpel_cli.console import Board, Terminal
@@ -145,14 +145,28 @@ def sweep(verb: str, overrides: list[str], config_dir: Path | None, cfg: str | N
     if cfg:
         launch(_root_of(verb), perform, first_job(overrides), config_dir=config_dir, flags=["--cfg", cfg])
         return
-    given = value_of("hydra.sweep.dir", overrides)
-    if given is not None and (Path(given) / RECORD).exists():
-        raise ConfigError(
-            f"hydra.sweep.dir: {given} holds a sweep already. Go on with `simpel sweep --resume {typed(given)}`, or choose "
-            "another directory; nothing was changed."
-        )
+    if (given := value_of("hydra.sweep.dir", overrides)) is not None:
+        _refuse_occupied(Path(given))
     folder = str(config_dir.absolute()) if config_dir is not None else None
     _run(Record(verb, overrides, folder, count_jobs(overrides)), overrides)
+
+
+def _refuse_occupied(root: Path) -> None:
+    """Look into a directory that the user names before anything is written to it."""
+    cure = "another directory; nothing was changed."
+    if (root / RECORD).exists():
+        raise ConfigError(
+            f"hydra.sweep.dir: {root} holds a sweep already. Go on with `simpel sweep --resume {typed(root)}`, or choose {cure}"
+        )
+    if root.exists() and not root.is_dir():
+        raise ConfigError(f"hydra.sweep.dir: {root} is a file. Choose {cure}")
+    # jobs with a number are of the same command, given again: another launcher was killed before it left a record
+    places = (run.directory for run in runs_below(root))
+    other = next((place for place in places if place.parent != root or not place.name.isdigit()), None)
+    if other is not None:
+        raise ConfigError(
+            f"hydra.sweep.dir: {root} holds other runs ({other}), which the sweep would take for its own. Choose {cure}"
+        )
 
 
 def resume(root: Path, overrides: list[str]) -> None:
