@@ -94,6 +94,8 @@ def test_fit_reads_the_corrected_simulator(run: Path) -> None:
     words = ("--config-dir", run / "run" / "conf", f"sim={path.stem}", "data=hidden_pendulum", "data.n_train=20")
     result = process(run, "fit", *words, "method.steps=20", "method.particles=3", "hydra.run.dir=fitted")
     assert result.code == 0, result.err
+    used = yaml.safe_load((run / "run" / "conf" / "data" / "hidden_pendulum.yaml").read_text())
+    assert Path(used["path"]).is_absolute()
 
 
 @pytest.mark.parametrize(

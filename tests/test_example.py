@@ -69,3 +69,7 @@ def test_the_friction_is_found(my: Path) -> None:
     # of sim/cart_true.yaml: 1 N on 1.2 kg
     assert verdict["effects"][0]["parameters"]["tau_c"]["value"] == pytest.approx(1 / 1.2, rel=0.02)
     assert verdict["parameters"]["m"]["after"]["value"] == pytest.approx(1.2, rel=0.01)
+    # and what is printed to go on with does, though the measurements are those of another folder
+    command = next(line for line in result.out.splitlines() if line.startswith("next ")).partition("simpel ")[2]
+    fitted = simpel(my, *shlex.split(command), *TINY, "hydra.run.dir=with_it")
+    assert fitted.code == 0, fitted.err

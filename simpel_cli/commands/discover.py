@@ -138,8 +138,12 @@ def _run(config: dict[str, Any], directory: Path, data_folder: Path, manifest: M
     if found["effects"]:
         name, node, left_out = corrected(config["sim"], model, search, selection.chosen)
         path = directory / "conf" / "sim" / f"{name}.yaml"
-        path.parent.mkdir(parents=True)
-        write_text(path, f"# {found['summary']}\n" + dump(node))
+        data = (
+            directory / "conf" / "data" / f"{config['choices'].get('data')}.yaml"
+        )  # the user's own lies in another folder
+        for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
+            file.parent.mkdir(parents=True)
+            write_text(file, content)
         found |= {
             "corrected_sim": str(path.relative_to(directory)),
             "corrected_sim_lacks": left_out,
