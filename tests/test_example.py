@@ -9,6 +9,7 @@ import pytest
 from command_line import TINY, simpel
 
 from simpel_cli.commands.example import SOURCE
+from simpel_cli.records import read_metrics
 
 
 @pytest.fixture
@@ -61,14 +62,18 @@ def test_launcher_of_its_own(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_friction_is_found(my: Path) -> None:
-    result = simpel(my, "discover", "--config-dir", ".", "experiment=cart", "close=false", "hydra.run.dir=found")
+def test_the_friction_is_found(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simpel_cli.commands.close.SIZES", (20, 10**6))  # there are not as many
+    small = [word for word in TINY if word.startswith("method.")]
+    result = simpel(my, "discover", "--config-dir", ".", "experiment=cart", *small, "hydra.run.dir=found")
     assert result.code == 0, result.err
     verdict = json.loads((my / "found" / "verdict.json").read_text())
     assert (verdict["verdict"], [effect["name"] for effect in verdict["effects"]]) == ("effect", ["coulomb_friction"])
     # of sim/cart_true.yaml: 1 N on 1.2 kg
     assert verdict["effects"][0]["parameters"]["tau_c"]["value"] == pytest.approx(1 / 1.2, rel=0.02)
     assert verdict["parameters"]["m"]["after"]["value"] == pytest.approx(1.2, rel=0.01)
+    assert ("20 transitions, 5 seeds: NLL" in result.out, "1000000 transitions" in result.out) == (True, False)
+    assert {row["n_train"] for row in read_metrics(my / "found" / "metrics.parquet")} == {20}
     # and what is printed to go on with does, though the measurements are those of another folder
     command = next(line for line in result.out.splitlines() if line.startswith("next ")).partition("simpel ")[2]
     fitted = simpel(my, *shlex.split(command), *TINY, "hydra.run.dir=with_it")

@@ -1,6 +1,7 @@
 """Closing the loop: SimPEL with the simulator as it was and with the corrected one as prior, on the same few transitions."""
 
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -48,11 +49,15 @@ def close(
     rows: list[dict[str, Any]] = []
     found: Summary = {"before": {}, "after": {}}
     for n in SIZES:
-        for label, sim in (("before", config["sim"]), ("after", corrected)):
-            data = config["data"] | {"n_train": n, "stack_actions": stack}
-            study = open_study(config | {"sim": sim, "data": data, "run": own_run}, data_folder)
-            if len(transitions(study.recording.train, stack).row) < n:
-                return found
+        began = perf_counter()
+        data = config["data"] | {"n_train": n, "stack_actions": stack}
+        sims = {"before": config["sim"], "after": corrected}
+        studies = {
+            k: open_study(config | {"sim": v, "data": data, "run": own_run}, data_folder) for k, v in sims.items()
+        }
+        if len(transitions(studies["before"].recording.train, stack).row) < n:
+            break
+        for label, study in studies.items():
             fitted = prepare(study)
             program = loop.compiled(fitted.bind, fitted.assembled.problems, fitted.keys, STRETCH)
             *_, last = loop.train(program, study.method.steps)
@@ -63,8 +68,8 @@ def close(
             same = study.constants | {"run": directory.name, "command": "discover", "n_train": n}
             rows += [same | row for row in judged.rows]
             found[label][str(n)] = _summary(judged.rows)
-        old, new = (found[label][str(n)] for label in ("before", "after"))
-        terminal.line(f"{n} transitions: {_compared(old, new)}", "prior")
+        compared = _compared(*(found[label][str(n)] for label in sims))
+        terminal.line(f"{n} transitions, {SEEDS} seeds: {compared} ({perf_counter() - began:.0f} s)", "prior")
     write_metrics(directory / "metrics.parquet", rows, {})
     return found
 
