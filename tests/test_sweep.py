@@ -27,24 +27,25 @@ def values(run: Path) -> list[object]:
     return [(r["metric"], r["output"], r["step"], r["value"]) for r in rows(run)]
 
 
-def statuses(sweep: Path, jobs: int) -> list[str]:
-    return [json.loads((sweep / str(i) / "manifest.json").read_text())["status"] for i in range(jobs)]
+def statuses(sweep: Path, jobs: int, below: str = "") -> list[str]:
+    return [json.loads((sweep / str(i) / below / "manifest.json").read_text())["status"] for i in range(jobs)]
 
 
 def test_a_job_that_fails_costs_itself_only(tmp_path: Path) -> None:
     words = ("experiment=pendulum", *TINY, "method.learning_rate=0.001,-1", "run.seed=1", "hydra.launcher.workers=1")
+    words = (*words, "hydra.sweep.subdir='${hydra.job.num}/fit'")  # directories may have one name
     first = simpel(tmp_path, "sweep", *words)  # into a directory of its own
     (folder,) = (tmp_path / "runs" / "sweep" / "pendulum").iterdir()
     folder.rename(tmp_path / "sweep")
     words = (*words, "hydra.sweep.dir=sweep")
     assert first.code == 2
     assert "1 of 2 jobs failed, the others are collected" in first.err
-    assert "method.learning_rate: got -1.0; it must be positive" in first.err
+    assert "1/fit: method.learning_rate: got -1.0; it must be positive" in first.err
     table = pq.read_table(tmp_path / "sweep" / "sweep.parquet").to_pylist()
     assert {(row["run"], row["seed"], row["split"]) for row in table} == {("method.learning_rate=0.001", 1, "test")}
-    assert statuses(tmp_path / "sweep", 2) == ["done", "failed"]
-    assert (tmp_path / "sweep" / "0" / "report.html").exists()
-    assert not list((tmp_path / "sweep" / "0").glob("*.png"))  # run.figures=false
+    assert statuses(tmp_path / "sweep", 2, "fit") == ["done", "failed"]
+    assert (tmp_path / "sweep" / "0" / "fit" / "report.html").exists()
+    assert not list((tmp_path / "sweep" / "0" / "fit").glob("*.png"))  # run.figures=false
     single = simpel(tmp_path, *FIT, "method.learning_rate=0.001", "run.seed=1", "hydra.run.dir=single")
     assert single.code == 0
     assert [r["value"] for r in table] == [r["value"] for r in rows(tmp_path / "single", split="test")]
@@ -54,13 +55,13 @@ def test_a_job_that_fails_costs_itself_only(tmp_path: Path) -> None:
         2,
         True,
     )
-    before = (tmp_path / "sweep" / "0" / "manifest.json").read_bytes()
+    before = (tmp_path / "sweep" / "0" / "fit" / "manifest.json").read_bytes()
     resumed = simpel(tmp_path, "sweep", "--resume", "sweep", "run.quiet=false")
     assert resumed.code == 2
     assert "1 of 2 jobs failed" in resumed.err
     assert "done before" in resumed.out
-    assert (tmp_path / "sweep" / "0" / "manifest.json").read_bytes() == before
-    assert (tmp_path / "sweep" / "1.failed-1" / "config.yaml").exists()
+    assert (tmp_path / "sweep" / "0" / "fit" / "manifest.json").read_bytes() == before
+    assert (tmp_path / "sweep" / "1" / "fit.failed-1" / "config.yaml").exists()
 
 
 def test_a_killed_worker_costs_one_retry_and_resume_goes_on_after_ctrl_c(tmp_path: Path) -> None:

@@ -100,6 +100,7 @@ class Cluster:
         self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()  # keys
         # here, and not with the scheduler: that would hold a dead worker against every job queued there
         self._waiting: deque[Job] = deque()
+        self._given = 0
         self._running: dict[str, tuple[Job, Any]] = {}  # key -> job and future
         self._close = contextlib.ExitStack()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said by outcomes
@@ -178,7 +179,8 @@ class Cluster:
             if not self._waiting:
                 return
             job = self._waiting.popleft()
-            key = f"{job.directory.name}-{self._token}"
+            key = f"{self._given}-{self._token}"  # not the directory's name, which several may share
+            self._given += 1
             future = self._client.submit(_work, job, self._token, key=key, pure=False)
             self._running[key] = (job, future)
             future.add_done_callback(lambda done: self._ended.put(done.key))

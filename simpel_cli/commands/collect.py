@@ -74,7 +74,7 @@ def collect(root: Path, words: list[str], terminal: Terminal) -> list[Found]:
                 rows += [row | {"run": own or job.directory.name} for row in metrics if row["split"] == "test"]
     left = [job for job in found if job.status != "done"]
     if left:
-        shown = ", ".join(job.directory.name for job in left[:10])
+        shown = ", ".join(str(job.directory.relative_to(root)) for job in left[:10])
         shown += f" and {len(left) - 10} more" if len(left) > 10 else ""
         terminal.line(f"not done: {shown}; `simpel sweep --resume {typed(root)}` runs them")
     if not rows:

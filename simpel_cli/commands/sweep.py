@@ -5,6 +5,7 @@ each where it likes, and finds the same `perform`. A job that fails, or a worker
 """
 
 import contextlib
+import os
 import threading
 from pathlib import Path
 from time import perf_counter
@@ -223,7 +224,7 @@ def _run(record: Record, words: list[str]) -> None:
                 if not ours:
                     write_record(root, record)
                 left = collect(root, record.words, terminal)
-    _refuse_failed(own.outcomes)
+    _refuse_failed(own.outcomes, root)
     if left:  # where another launcher ran them, nothing else tells
         raise SimpelError(f"{len(left)} of {record.jobs} jobs are not done, the others are collected.")
 
@@ -233,10 +234,10 @@ def _queue_or_perform(job: Job) -> Any:
     return DaskLauncher.queue(job) if DaskLauncher.chosen else perform(job)
 
 
-def _refuse_failed(outcomes: list[Outcome]) -> None:
+def _refuse_failed(outcomes: list[Outcome], root: Path | None) -> None:
     failed = [o for o in outcomes if o.code]
     if failed:
-        names = "; ".join(f"{o.directory.name}: {o.error}" for o in failed[:5])
+        names = "; ".join(f"{os.path.relpath(o.directory, root)}: {o.error}" for o in failed[:5])
         error = SimpelError(f"{len(failed)} of {len(outcomes)} jobs failed, the others are collected. {names}")
         error.exit_code = failed[0].code
         raise error
