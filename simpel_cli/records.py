@@ -175,7 +175,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
     try:
         return read_table(path).to_pylist()
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not readable as metrics ({str(error).splitlines()[0]}).") from error
 
 

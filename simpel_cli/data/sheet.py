@@ -114,10 +114,12 @@ def _read_parquet(path: Path) -> Sheet:
     try:
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             content = file.read()
-    except (pa.ArrowException, OSError) as error:
+        content.validate(full=True)  # of texts, that they are some
+        names = content.column_names
+        units = {f.name: f.metadata[b"unit"].decode() for f in content.schema if f.metadata and b"unit" in f.metadata}
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path.name} is damaged, cut off or no Parquet file. Copy or write it again.") from error
-    _refuse_repeated(path, content.column_names)
-    units = {f.name: f.metadata[b"unit"].decode() for f in content.schema if f.metadata and b"unit" in f.metadata}
+    _refuse_repeated(path, names)
     return Sheet(path, {name: _plain(content[name]) for name in content.column_names}, units)
 
 

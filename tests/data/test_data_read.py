@@ -1,5 +1,6 @@
 """Reading files: what comes out, and the message for everything that can be wrong with a file or its YAML."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from simpel_cli.data import Measurements, Recording, read, transitions
+from simpel_cli.data.sheet import read_sheet
 from simpel_cli.errors import ConfigError, DataError, SimpelError
 from simulators.model import Declared, Model
 
@@ -215,6 +217,22 @@ def test_cut_off_parquet_gets_a_short_message(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"half\.parquet is damaged, cut off") as error:
         read(Measurements("half.parquet"), CART, tmp_path, 0)
     assert len(str(error.value)) < 120
+
+
+def test_a_parquet_file_with_any_byte_changed_is_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.parquet"
+    table = pa.table({"größe": ["ä", "b", "ä"], "pos": [0.1, 0.2, 0.3]})
+    unit = table.schema.field("pos").with_metadata({"unit": "°"})
+    parquet.write_table(table.cast(pa.schema([table.schema.field(0), unit])), path)
+    content = path.read_bytes()
+    for i in range(len(content)):
+        path.write_bytes(content[:i] + bytes([content[i] ^ 0xFF]) + content[i + 1 :])
+        with contextlib.suppress(DataError):
+            sheet = read_sheet(path)
+            for name in sheet.columns:
+                with contextlib.suppress(DataError):
+                    sheet.labels(name)
+                    sheet.numbers(name)
 
 
 def test_latin1_is_named(tmp_path: Path) -> None:
