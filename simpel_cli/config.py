@@ -48,6 +48,7 @@ def recordings_dir() -> Path:
 CONTROL = ("rl-offline", "rl-online")
 # group -> key, of the verbs of control: an experiment brings them, there is no default
 BROUGHT = {"reward": "reward", "sim@truth": "truth", "sim@mujoco": "mujoco"}
+GROUPS = ("sim", "data", "prior", "score", "method", "choices")  # in every configuration that a run keeps
 
 
 class Job(typing.NamedTuple):
@@ -233,7 +234,7 @@ def checked(overrides: list[str]) -> list[str]:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a resolved configuration that a run wrote.
+    """Read YAML that a run wrote.
 
     Raises:
         ConfigError: missing or not YAML.
@@ -248,6 +249,21 @@ def load(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not readable ({str(error).splitlines()[0]}).") from error
     if not isinstance(config, dict):
         raise ConfigError(f"{path}: not a configuration of simpel.")
+    return config
+
+
+def of_run(directory: Path) -> dict[str, Any]:
+    """Read the resolved configuration of a run.
+
+    Raises:
+        ConfigError: missing, not YAML, or cut off.
+    """
+    path = directory / "config.yaml"
+    config = load(path)
+    if lacking := [group for group in GROUPS if not isinstance(config.get(group), dict)]:
+        raise ConfigError(
+            f"{path}: damaged or cut off ({', '.join(lacking)} missing). Restore it, or make the run again."
+        )
     return config
 
 

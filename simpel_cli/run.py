@@ -267,7 +267,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{directory}: not a run directory (it has no manifest.json). Run directories lie under runs/."
         ) from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not readable ({error}).") from error
     if not isinstance(record, dict) or "command" not in record:
         raise ConfigError(f"{path}: not a manifest of simpel (no key `command`).")

@@ -15,7 +15,7 @@ import pytest
 from command_line import FIT, TINY, rig, simpel
 
 from simpel_cli import nodes
-from simpel_cli.config import conf_dir, load
+from simpel_cli.config import GROUPS, conf_dir, load
 from simpel_cli.transition import encoding_of, transition
 from simulators.model import Model
 from simulators.step import one_step
@@ -162,7 +162,7 @@ def test_the_simulator_that_discover_corrected(tmp_path: Path) -> None:
     (run / "conf" / "sim").mkdir(parents=True)
     my = rig(tmp_path)
     cart = load(my / "sim" / "cart.yaml")
-    (run / "config.yaml").write_text(json.dumps({"sim": cart, "run": {}}))
+    (run / "config.yaml").write_text(json.dumps({group: {} for group in GROUPS} | {"sim": cart}))
     (run / "manifest.json").write_text(json.dumps({"command": "discover", "status": "done"}))
     (run / "conf" / "sim" / "cart_with_leak.yaml").write_text(
         json.dumps(cart | {"name": "cart_with_leak", "parameters": cart["parameters"] | {"b": {"range": [0.1, 0.3]}}})

@@ -330,6 +330,22 @@ class TestOfARun:
         assert result.code == CONFIG
         assert "state.safetensors: damaged or not a checkpoint of simpel" in result.err
 
+    def test_a_configuration_that_was_cut_off(self, folder: Path, tmp_path: Path) -> None:
+        shutil.copytree(folder / "run", tmp_path / "run")
+        config = tmp_path / "run" / "config.yaml"
+        text = config.read_text()
+        config.write_text(text[: text.index("prior:")])
+        for verb in ("evaluate", "export"):
+            result = simpel(tmp_path, verb, "run")
+            assert result.code == CONFIG
+            assert "config.yaml: damaged or cut off (prior, score, method, choices missing). Restore it" in result.err
+
+    def test_a_manifest_with_a_number_that_python_does_not_read(self, folder: Path, tmp_path: Path) -> None:
+        shutil.copytree(folder / "run", tmp_path / "run")
+        (tmp_path / "run" / "manifest.json").write_text('{"command": "fit", "seed": ' + 5000 * "9" + "}")
+        result = simpel(tmp_path, "evaluate", "run")
+        assert (result.code, "manifest.json: not readable" in result.err) == (CONFIG, True)
+
     def test_checkpoint_of_another_configuration(self, folder: Path, tmp_path: Path) -> None:
         shutil.copytree(folder / "run", tmp_path / "run")
         config = tmp_path / "run" / "config.yaml"

@@ -9,7 +9,7 @@ from simpel_cli.commands.judge import judge
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe_data, publish
 from simpel_cli.commands.study import Study, open_study, posteriors, prepare, resolved, settings_of
-from simpel_cli.config import Job, dump, load
+from simpel_cli.config import Job, dump, of_run
 from simpel_cli.console import Terminal
 from simpel_cli.data import Check
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
@@ -30,7 +30,7 @@ def evaluate(job: Job) -> None:
     record = read_manifest(run)
     if record["command"] != "fit":
         raise ConfigError(f"{run}: made by `simpel {record['command']}`; evaluate takes the directory of a fit.")
-    trained = load(run / "config.yaml")
+    trained = of_run(run)
     own = resolved(job)
     config = trained | {name: (trained.get(name) or {}) | (own.get(name) or {}) for name in ("run", "evaluation")}
     settings = ", ".join(f"run.{k}" for k in OWN_SETTINGS)

@@ -18,7 +18,7 @@ import casadi
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.config import dump, load
+from simpel_cli.config import dump, load, of_run
 from simpel_cli.console import Terminal
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
@@ -55,7 +55,7 @@ def export(run: Path, out: Path | None = None, seed: int | None = None) -> None:
             f"{run}: {record.get('status')}, not done. Go on with it first: simpel {verb} --resume {typed(run)}"
         )
     folder = run / VERBS[verb]
-    config = load(folder / "config.yaml")
+    config = of_run(folder)
     settings = build(config.get("run") or {}, "run", default=Settings)
     into = make_directory(out if out is not None else run / "export", "--out")
     terminal = Terminal(quiet=False)

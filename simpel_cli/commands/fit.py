@@ -14,7 +14,7 @@ from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
-from simpel_cli.config import Job, dump, load
+from simpel_cli.config import Job, dump, of_run
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.records import MetricStream, write_table, write_text
@@ -58,7 +58,7 @@ def resume(directory: Path) -> None:
     if record["command"] != "fit":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`; only a fit can be resumed.")
     refuse_changed_config(directory, record)
-    config = load(directory / "config.yaml")
+    config = of_run(directory)
     if record.get("status") == "done":
         Terminal(settings_of(config).quiet).line(f"{directory} is complete; nothing to do.")
         return

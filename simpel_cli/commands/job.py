@@ -10,7 +10,7 @@ from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
 from simpel_cli.commands.gather import ASIDE
-from simpel_cli.config import Job, load
+from simpel_cli.config import Job, of_run
 from simpel_cli.console import silence
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.interruption import interruption, stop_if
@@ -126,7 +126,7 @@ def _changed(job: Job) -> str:
     def plain(config: dict[str, Any]) -> dict[str, Any]:
         return config | {"run": {k: v for k, v in (config.get("run") or {}).items() if k not in own}}
 
-    return _difference(plain(load(job.directory / "config.yaml")), plain(resolved(job)))
+    return _difference(plain(of_run(job.directory)), plain(resolved(job)))
 
 
 def _difference(old: Any, new: Any, path: str = "") -> str:

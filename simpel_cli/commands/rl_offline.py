@@ -19,7 +19,7 @@ from simpel_cli.commands.control import (
 )
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.study import open_study, resolved, settings_of
-from simpel_cli.config import Job, dump, load
+from simpel_cli.config import Job, dump, of_run
 from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
 from simpel_cli.interruption import interruption, stop_if
@@ -69,7 +69,7 @@ def resume(directory: Path) -> None:
     if record["command"] != "rl-offline":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-offline.")
     refuse_changed_config(directory, record)
-    config = load(directory / "config.yaml")
+    config = of_run(directory)
     left = [directory / "report.html", directory / "metrics.parquet"]
     left += [] if config.get("planner") else [directory / "policy" / "policy.safetensors"]
     if record.get("status") == "done" and all(path.exists() for path in left):

@@ -16,7 +16,7 @@ from simpel_cli.commands.control import Assignment, Flown, assignment, remarks, 
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.rl_offline import OWN, done_steps, saved_policies
 from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
-from simpel_cli.config import Job, dump, load
+from simpel_cli.config import Job, dump, of_run
 from simpel_cli.console import Terminal
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
@@ -101,7 +101,7 @@ def resume(directory: Path, overrides: Sequence[str] = ()) -> None:
     if record["command"] != "rl-online":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-online.")
     refuse_changed_config(directory, record)
-    config = load(directory / "config.yaml")
+    config = of_run(directory)
     old = build(config.get("online") or {}, "online", default=Online).episodes
     episodes = _more(overrides, old)
     if episodes > old:
