@@ -16,34 +16,8 @@ from typing import Any
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.hydra_errors import translated, unknown_root
+from simpel_cli.places import conf_dir, example_data_dir, recordings_dir, require_recordings
 from simpel_cli.run import refuse_occupied
-
-
-def conf_dir() -> Path:
-    """Return the folder of the built-in configuration: inside the wheel, else the checkout's."""
-    inside = Path(__file__).parent / "conf"
-    return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
-
-
-def example_data_dir() -> Path:
-    """Return the folder of the measurements that come with simpel: inside the wheel, else the checkout's."""
-    inside = Path(__file__).parent / "example_data"
-    return inside if inside.is_dir() else Path(__file__).parents[1] / "data"
-
-
-def recordings_dir() -> Path:
-    """Return the folder that SIMPEL_SHARED names: recordings that do not come with simpel; else `shared` beside a checkout.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    given = os.environ.get("SIMPEL_SHARED")
-    folder = Path(given).expanduser().absolute() if given else Path(__file__).parents[2] / "shared"
-    if not folder.is_dir():
-        tried = f"SIMPEL_SHARED is {given!r}, which" if given else f"SIMPEL_SHARED is not set, and {folder}"
-        raise ConfigError(f"{tried} is no folder. The recordings do not come with simpel: export SIMPEL_SHARED=FOLDER.")
-    return folder
-
 
 CONTROL = ("rl-offline", "rl-online")
 # group -> key, of the verbs of control: an experiment brings them, there is no default
@@ -109,6 +83,7 @@ def launch(
                     raise ConfigError(unknown_root(str(key), verb, known))
                 del plain[key]
             folder = _group_folder("data", hydra_config.runtime.choices.get("data"), user)
+            require_recordings(plain.get("data"))
             directory = Path(hydra_config.runtime.output_dir)
             if config_dir is not None and "choices" in plain:
                 plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with

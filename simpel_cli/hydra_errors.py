@@ -117,8 +117,6 @@ def _interpolation(text: str, key: str) -> str:
     if found := re.search(r"Unsupported interpolation type (.+)", text):
         known = "${oc.env:NAME}, ${simpel_data:}, ${simpel_shared:} and ${key}"
         return f"${{{found[1]}:...}} is unknown; allowed are {known}."
-    if found := re.search(r"ConfigError raised while resolving interpolation: (.+)", text):
-        return found[1]
     if "Cannot merge" in text and "ListConfig" in text:
         return (
             "a list and a mapping cannot be merged. Take away what stands there, then give yours: "

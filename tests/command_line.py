@@ -6,6 +6,7 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,10 @@ import numpy as np
 import pyarrow.parquet as pq
 
 ROOT = Path(__file__).parents[1]
-CACHE = ROOT / ".pytest_cache" / "cache"  # compiled programs are shared by all tests and their processes
+KEPT = (
+    ROOT / ".pytest_cache" if os.access(ROOT, os.W_OK) else Path(tempfile.gettempdir()) / f"simpel-tests-{os.getuid()}"
+)
+CACHE = KEPT / "cache"  # compiled programs are shared by all tests and their processes
 PATIENCE = 1800.0  # s for a process that hangs; a loaded machine is no failure
 TINY = (
     "method.steps=100", "method.particles=4", "method.network.hidden=[16,16]", "method.pool=64", "method.sets=16",

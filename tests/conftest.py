@@ -7,10 +7,10 @@ from pathlib import Path
 
 import jax
 import pytest
+from command_line import KEPT, ROOT
 
 import simpel_cli  # noqa: F401  sets XLA's flags before JAX opens its backend
 
-ROOT = Path(__file__).parents[1]
 LONGEST = (
     "wrong_inputs", "cli", "discover", "resume", "discovery_filter", "methods", "own_data", "recorded_systems", "scores",
     "discover_hopeless", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
@@ -25,13 +25,17 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # compiled programs are shared between tests, workers and runs
-jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "xla"))
+jax.config.update("jax_compilation_cache_dir", str(KEPT / "xla"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first, so that the workers of `make test` end together."""
+    """Mark the tests that need recordings; put the longest files first, so that the workers of `make test` end together."""
+    for item in items:
+        if "shared" in getattr(item, "fixturenames", ()):
+            item.add_marker("needs_recordings")
     rank = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 

@@ -11,9 +11,10 @@ from command_line import ROOT, simpel
 from omegaconf import OmegaConf
 
 from simpel_cli.commands.study import Evaluation
-from simpel_cli.config import checked, conf_dir, count_jobs
+from simpel_cli.config import checked, count_jobs
 from simpel_cli.data import Measurements
 from simpel_cli.nodes import build
+from simpel_cli.places import conf_dir
 from simpel_cli.run import Settings
 from simulators.built import Built
 from simulators.model import Model

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from command_line import TINY, simpel
+from command_line import TINY, rig, simpel
 from systems import model
 
 from simpel_cli.transition import encoding_of, transition
@@ -101,3 +101,15 @@ def test_recordings_that_are_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     assert result.code == 2
     assert f"data.path: SIMPEL_SHARED is '{tmp_path / 'nowhere'}', which is no folder" in result.err
     assert "export SIMPEL_SHARED=FOLDER" in result.err
+
+
+def test_an_experiment_composes_without_its_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SIMPEL_SHARED", str(tmp_path / "nowhere"))
+    result = simpel(tmp_path, "fit", "experiment=rc_car", "--cfg", "job")
+    assert result.code == 0, result.err
+    measured = rig(tmp_path)  # measurements of one's own need no recordings
+    result = simpel(
+        tmp_path, "fit", "--config-dir", measured, "experiment=emps", "sim=cart", "data=rig", "method.steps=x"
+    )
+    assert "SIMPEL_SHARED" not in result.err
+    assert "method.steps" in result.err

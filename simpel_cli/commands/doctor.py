@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.config import conf_dir, load, recordings_dir
+from simpel_cli.config import load
 from simpel_cli.console import Terminal, aligned
 from simpel_cli.errors import SimpelError
+from simpel_cli.places import conf_dir, recordings_dir
 from simpel_cli.run import Settings, cache_directory, configure, versions
 
 MARKS = {"ok": "ok", "look": "look", "wrong": "WRONG"}
@@ -112,10 +113,9 @@ def _room(what: str, free: float, least: float, cure: str) -> Finding:
 
 
 def _recordings() -> Finding:
-    try:
-        return Finding("SIMPEL_SHARED", "ok", str(recordings_dir()))
-    except SimpelError:
-        return Finding("SIMPEL_SHARED", "ok", "no recordings here; experiments that need them say so")
+    folder = recordings_dir()
+    there = str(folder) if folder.is_dir() else "no recordings here; experiments that need them say so"
+    return Finding("SIMPEL_SHARED", "ok", there)
 
 
 def _tested(what: str, test: Callable[[], tuple[bool, str]]) -> Finding:
