@@ -17,7 +17,7 @@ from typing import Any
 from simpel_cli.errors import ConfigError
 from simpel_cli.hydra_errors import translated, unknown_root
 from simpel_cli.places import conf_dir, example_data_dir, recordings_dir, require_recordings
-from simpel_cli.run import refuse_occupied
+from simpel_cli.runs.directory import refuse_occupied
 
 CONTROL = ("rl-offline", "rl-online")
 # group -> key, of the verbs of control: an experiment brings them, there is no default

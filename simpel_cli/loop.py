@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
-from simpel_cli.interruption import interruption
+from simpel_cli.runs.interruption import interruption
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
-from simpel_cli.interruption import never_lost
+from simpel_cli.runs.interruption import never_lost
 
 if TYPE_CHECKING:
     from simpel_cli.config import Job
@@ -132,7 +132,7 @@ def evaluate(
             f"evaluate: the first word is the directory of a fit, got {run_dir}: simpel evaluate RUN_DIR {run_dir}"
         )
     from simpel_cli.commands.evaluate import evaluate as task
-    from simpel_cli.run import read_manifest
+    from simpel_cli.runs.manifest import read_manifest
 
     read_manifest(run_dir)
     quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")

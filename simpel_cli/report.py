@@ -4,7 +4,7 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.records import write_text
+from simpel_cli.runs.files import write_text
 
 SCREEN, DPI = 96, 130  # pixels per inch of a page, and of the figures
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.records import write_table
+from simpel_cli.runs.files import write_table
 
 SIM: dict[str, Any] = {
     "_target_": "simulators.model.Declared",

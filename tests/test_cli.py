@@ -18,7 +18,7 @@ import yaml
 from command_line import FIT, ROOT, TINY, csv, environment, rig, rows, simpel, swing
 from safetensors.numpy import load_file
 
-from simpel_cli.run import sha256
+from simpel_cli.runs.manifest import sha256
 
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),
@@ -400,7 +400,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, text: str) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr("simpel_cli.run.write_text", full)
+    monkeypatch.setattr("simpel_cli.runs.manifest.write_text", full)
     result = simpel(tmp_path, *FIT, "hydra.run.dir=run")
     assert result.code == 1
     assert "run/manifest.json: No space left on device. What was complete before is kept; make room" in result.err

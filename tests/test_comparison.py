@@ -12,7 +12,8 @@ import pytest
 from command_line import simpel
 
 from simpel_cli.evaluation.comparison import Mean, Metric, best, difference, mean
-from simpel_cli.records import read_metrics, write_metrics, write_table
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.metrics import read_metrics, write_metrics
 
 SIZES, SEEDS = (10, 40), (0, 1, 2)
 LEVEL = {("simpel", 10): -8.0, ("simpel", 40): -9.0, ("fsvgd", 10): 20.0, ("fsvgd", 40): -8.9}

@@ -15,7 +15,7 @@ from simpel_cli.config import checked, count_jobs
 from simpel_cli.data import Measurements
 from simpel_cli.nodes import build
 from simpel_cli.places import conf_dir
-from simpel_cli.run import Settings
+from simpel_cli.runs.settings import Settings
 from simulators.built import Built
 from simulators.model import Model
 from simulators.worlds.simulate import Simulate

@@ -405,7 +405,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_run_holds_what_is_promised(flown: Path) -> None:
-    from simpel_cli.records import read_metrics
+    from simpel_cli.runs.metrics import read_metrics
 
     assert json.loads((flown / "manifest.json").read_text())["status"] == "done"
     for name in (

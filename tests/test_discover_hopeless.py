@@ -14,7 +14,7 @@ from simpel_cli.data import Episode, Recording
 from simpel_cli.discovery.cleaned import cleaned, is_noise, measured
 from simpel_cli.discovery.windows import windows_of
 from simpel_cli.errors import DataError
-from simpel_cli.records import strict
+from simpel_cli.runs.files import strict
 from simulators.model import Declared, Model
 
 SEARCH = ("discover", "--config-dir", "my", "sim=cart", "data=rig", "close=false", "hydra.run.dir=run")

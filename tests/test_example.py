@@ -9,7 +9,7 @@ import pytest
 from command_line import TINY, simpel
 
 from simpel_cli.commands.example import SOURCE
-from simpel_cli.records import read_metrics
+from simpel_cli.runs.metrics import read_metrics
 
 
 @pytest.fixture

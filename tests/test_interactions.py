@@ -10,7 +10,6 @@ import pytest
 from test_discovery_filter import DT, LOAD, model, recording
 
 from simpel_cli.commands.discover import _gated, _of_two
-from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.coordinates import CUT
@@ -25,6 +24,7 @@ from simpel_cli.discovery.settings import Discovery
 from simpel_cli.discovery.setup import Setup, key_of, setup
 from simpel_cli.discovery.setup import test_windows as windows_of_tests
 from simpel_cli.discovery.verdict import verdict_of
+from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, functions_of_two
 from simulators.model import Declared
 

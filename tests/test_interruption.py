@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from simpel_cli.interruption import never_lost
+from simpel_cli.runs.interruption import never_lost
 
 
 class Interrupting:

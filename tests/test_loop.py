@@ -10,7 +10,7 @@ import pytest
 
 from simpel_cli import loop
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
-from simpel_cli.interruption import interruption
+from simpel_cli.runs.interruption import interruption
 
 RATE, DIM = 0.1, 3
 

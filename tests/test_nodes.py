@@ -105,7 +105,7 @@ class TestBuild:
 
     @pytest.mark.parametrize(
         "target",
-        ["simpel_cli.nodes.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.run.os.system"],
+        ["simpel_cli.nodes.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.runs.lock.os.system"],
     )
     def test_fence_holds_for_what_a_module_imports(self, target: str) -> None:
         with pytest.raises(ConfigError, match=r"cannot import|is not a dataclass"):

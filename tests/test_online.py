@@ -28,7 +28,6 @@ from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.nets import MLP
 from simpel_cli.nodes import build
-from simpel_cli.records import read_metrics, write_table
 from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import contract, load_policy, save_policy
@@ -39,7 +38,9 @@ from simpel_cli.rl.rollout import episodes, reflex
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Task
 from simpel_cli.rl.world import true_world
-from simpel_cli.run import stream
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.metrics import read_metrics
+from simpel_cli.runs.settings import stream
 from simpel_cli.transition import encoding_of, transition
 
 HORIZON = 12

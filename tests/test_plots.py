@@ -9,7 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from simpel_cli.plots import run
-from simpel_cli.records import read_metrics, write_metrics, write_table
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.metrics import read_metrics, write_metrics
 
 MANY = tuple(f"position_of_joint_{i}" for i in range(15))
 LEVELS = np.arange(0.05, 0.951, 0.05)

@@ -6,8 +6,9 @@ import numpy as np
 from PIL import Image
 
 from simpel_cli.plots.control import draw_control
-from simpel_cli.records import write_metrics, write_table
 from simpel_cli.report import figure, write_report
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.metrics import write_metrics
 
 CONSTANTS = {
     "run": "r",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.plots import draw_sweep, sweep
-from simpel_cli.records import write_metrics
+from simpel_cli.runs.metrics import write_metrics
 
 SIZES = (10, 20)
 

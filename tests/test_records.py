@@ -9,16 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.records import (
-    MetricStream,
-    load_checkpoint,
-    read_metrics,
-    replacing,
-    save_checkpoint,
-    write_metrics,
-    write_table,
-    write_text,
-)
+from simpel_cli.runs.arrays import load_checkpoint, save_checkpoint
+from simpel_cli.runs.files import replacing, write_table, write_text
+from simpel_cli.runs.metrics import MetricStream, read_metrics, write_metrics
 
 CONSTANTS = {
     "run": "r",

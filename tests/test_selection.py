@@ -11,7 +11,6 @@ import pytest
 
 from simpel_cli.commands import discover
 from simpel_cli.commands.discover import _calibrated, _gated
-from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import search as search_module
 from simpel_cli.discovery.assess import Assessor
@@ -21,6 +20,7 @@ from simpel_cli.discovery.gate import Gate
 from simpel_cli.discovery.screen import Score, promises
 from simpel_cli.discovery.search import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.selection import cut, further, select
+from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
 from tests.test_swings import pushed
 from tests.test_twins import searched

@@ -16,7 +16,7 @@ from command_line import FIT, PATIENCE, TINY, environment, rows, simpel, start
 
 from simpel_cli.commands.cluster import Options
 from simpel_cli.errors import ConfigError
-from simpel_cli.run import is_locked, locked
+from simpel_cli.runs.lock import is_locked, locked
 
 # long enough to be killed amid it; the same job several times, so that each says what the others should have come to
 LONG = ("experiment=pendulum", *TINY, "method.steps=3000", "run.quiet=false")

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from simpel_cli.config import load, options
-from simpel_cli.console import Terminal, aligned
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
+from simpel_cli.runs.console import Terminal, aligned
 from simulators.quantity import ModelError
 
 WIDTH = 48  # of a list of names in the table

@@ -5,13 +5,14 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.commands.gather import Found, runs_below
 from simpel_cli.config import swept_keys
-from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.plots import draw_sweep
-from simpel_cli.records import read_metrics, write_metrics, write_text
-from simpel_cli.run import typed
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import typed
+from simpel_cli.runs.files import write_text
+from simpel_cli.runs.finding import Found, runs_below
+from simpel_cli.runs.metrics import read_metrics, write_metrics
 
 RECORD = "sweep.json"
 HEADLINES = {  # metric -> what it is called in a line

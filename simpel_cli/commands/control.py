@@ -11,17 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli import loop
-from simpel_cli.commands.checkpoint import keep, restored
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
-from simpel_cli.console import Terminal
 from simpel_cli.data.recording import Source
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
-from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.nodes import build
-from simpel_cli.records import MetricStream
 from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
@@ -31,7 +27,11 @@ from simpel_cli.rl.rollout import Episodes, episodes, reflex
 from simpel_cli.rl.sac import SAC, Rule
 from simpel_cli.rl.task import Goal, Task
 from simpel_cli.rl.world import World, beginning_at, learned_world, true_world
-from simpel_cli.run import Settings, stream
+from simpel_cli.runs.checkpoint import keep, restored
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.interruption import interruption, stop_if
+from simpel_cli.runs.metrics import MetricStream
+from simpel_cli.runs.settings import Settings, stream
 from simpel_cli.transition import encoding_of, transition
 from simulators.model import Model
 

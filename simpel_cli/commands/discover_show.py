@@ -7,11 +7,11 @@ import numpy as np
 
 from simpel_cli.commands.discover_report import HORIZONS, reliable, rows_of, sections_of, untested, words
 from simpel_cli.config import dump, load
-from simpel_cli.console import Terminal
 from simpel_cli.discovery.unseen import in_words
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import write_report
-from simpel_cli.run import typed
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import typed
 
 KINDS = {
     "effect": "An effect was found.",

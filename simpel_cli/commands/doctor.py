@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.config import load
-from simpel_cli.console import Terminal, aligned
 from simpel_cli.errors import SimpelError
 from simpel_cli.places import conf_dir, recordings_dir
-from simpel_cli.run import Settings, cache_directory, configure, versions
+from simpel_cli.runs.console import Terminal, aligned
+from simpel_cli.runs.manifest import versions
+from simpel_cli.runs.settings import Settings, cache_directory, configure
 
 MARKS = {"ok": "ok", "look": "look", "wrong": "WRONG"}
 LEAST_DISK = 2e9  # bytes
@@ -185,7 +186,8 @@ def _gradient() -> tuple[bool, str]:
 
 def _files() -> tuple[bool, str]:
     """Write a checkpoint and metrics, and read them back."""
-    from simpel_cli.records import load_checkpoint, read_metrics, save_checkpoint, write_metrics
+    from simpel_cli.runs.arrays import load_checkpoint, save_checkpoint
+    from simpel_cli.runs.metrics import read_metrics, write_metrics
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -10,11 +10,13 @@ from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe_data, publish
 from simpel_cli.commands.study import Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, of_run
-from simpel_cli.console import Terminal
 from simpel_cli.data import Check
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
-from simpel_cli.records import write_metrics, write_text
-from simpel_cli.run import Manifest, make_directory, read_manifest, refuse_occupied, sha256
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied
+from simpel_cli.runs.files import write_text
+from simpel_cli.runs.manifest import Manifest, read_manifest, sha256
+from simpel_cli.runs.metrics import write_metrics
 
 CARDS = (".yaml",)  # describe columns; one may lie beside several files
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit

@@ -3,9 +3,9 @@
 import shutil
 from pathlib import Path
 
-from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
-from simpel_cli.run import make_directory, typed
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, typed
 
 SOURCE = Path(__file__).parents[1] / "example"
 

@@ -19,13 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.config import dump, load, of_run
-from simpel_cli.console import Terminal
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
 from simpel_cli.nodes import build
-from simpel_cli.records import load_checkpoint, replacing, write_arrays, write_text
-from simpel_cli.run import Settings, make_directory, read_manifest, typed
+from simpel_cli.runs.arrays import load_checkpoint, write_arrays
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, typed
+from simpel_cli.runs.files import replacing, write_text
+from simpel_cli.runs.manifest import read_manifest
+from simpel_cli.runs.settings import Settings
 from simulators.model import Model, ModelError
 
 VERBS = {"fit": ".", "discover": ".", "rl-offline": "posterior"}

@@ -8,26 +8,20 @@ import jax
 import numpy as np
 
 from simpel_cli import loop
-from simpel_cli.commands.checkpoint import keep, restored
 from simpel_cli.commands.judge import Judged, judge
 from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config import Job, dump, of_run
-from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError, DataError
-from simpel_cli.records import MetricStream, write_table, write_text
-from simpel_cli.run import (
-    Manifest,
-    make_directory,
-    read_manifest,
-    refuse_changed_config,
-    refuse_occupied,
-    sha256,
-    typed,
-)
-from simpel_cli.tensorboard import Scalars
+from simpel_cli.runs.checkpoint import keep, restored
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config, sha256
+from simpel_cli.runs.metrics import MetricStream
+from simpel_cli.runs.tensorboard import Scalars
 
 LOG_EVERY = 50  # steps per row of the metric table
 DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured

@@ -9,12 +9,14 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
-from simpel_cli.commands.gather import ASIDE
 from simpel_cli.config import Job, of_run
-from simpel_cli.console import silence
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
-from simpel_cli.interruption import interruption, stop_if
-from simpel_cli.run import RESUMED, is_locked, read_manifest
+from simpel_cli.runs.console import silence
+from simpel_cli.runs.directory import RESUMED
+from simpel_cli.runs.finding import ASIDE
+from simpel_cli.runs.interruption import interruption, stop_if
+from simpel_cli.runs.lock import is_locked
+from simpel_cli.runs.manifest import read_manifest
 
 # verb -> module and function; imported where a job runs
 STARTS = {

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 
 from simpel_cli.commands.study import Fitted, Study
-from simpel_cli.console import Terminal
 from simpel_cli.prior_predictive import OutputCheck, PriorCheck, check_prior
-from simpel_cli.run import stream
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.settings import stream
 
 
 def look_at_prior(study: Study, fitted: Fitted) -> PriorCheck | None:

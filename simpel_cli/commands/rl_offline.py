@@ -20,26 +20,21 @@ from simpel_cli.commands.control import (
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config import Job, dump, of_run
-from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
-from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.plots.canvas import with_interval
 from simpel_cli.plots.control import draw_control
-from simpel_cli.records import MetricStream, load_checkpoint, write_table, write_text
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.files import contract, save_policy
 from simpel_cli.rl.rollout import Episodes
-from simpel_cli.run import (
-    Manifest,
-    configure,
-    make_directory,
-    read_manifest,
-    refuse_changed_config,
-    refuse_occupied,
-    stream,
-    typed,
-)
-from simpel_cli.tensorboard import Scalars
+from simpel_cli.runs.arrays import load_checkpoint
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.interruption import interruption, stop_if
+from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
+from simpel_cli.runs.metrics import MetricStream
+from simpel_cli.runs.settings import configure, stream
+from simpel_cli.runs.tensorboard import Scalars
 
 OWN = (
     "policy",

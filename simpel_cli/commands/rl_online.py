@@ -17,14 +17,11 @@ from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.rl_offline import OWN, done_steps, saved_policies
 from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
 from simpel_cli.config import Job, dump, of_run
-from simpel_cli.console import Terminal
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
-from simpel_cli.interruption import interruption, stop_if
 from simpel_cli.nodes import build
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online
-from simpel_cli.records import MetricStream, write_metrics, write_text
 from simpel_cli.report import figure, write_report
 from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
@@ -32,18 +29,14 @@ from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.online import Online
 from simpel_cli.rl.plant import Plant, Ride, Simulated, Stepped, write_ride
 from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
-from simpel_cli.run import (
-    Manifest,
-    Settings,
-    configure,
-    make_directory,
-    read_manifest,
-    refuse_changed_config,
-    refuse_occupied,
-    stream,
-    typed,
-)
-from simpel_cli.tensorboard import Scalars
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
+from simpel_cli.runs.files import write_text
+from simpel_cli.runs.interruption import interruption, stop_if
+from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
+from simpel_cli.runs.metrics import MetricStream, write_metrics
+from simpel_cli.runs.settings import Settings, configure, stream
+from simpel_cli.runs.tensorboard import Scalars
 from simulators.model import Model
 
 WORLDS = "sim, mujoco, gymnasium:ID and folder:DIR"

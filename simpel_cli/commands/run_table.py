@@ -7,7 +7,7 @@ import numpy as np
 
 from simpel_cli.commands.judge import Judged
 from simpel_cli.commands.study import Fitted, Study
-from simpel_cli.run import Manifest, versions
+from simpel_cli.runs.manifest import Manifest, versions
 
 PHASES = (("compilation", "compile_seconds"), ("training", "train_seconds"))
 

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from simpel_cli.commands.study import settings_of, source_of
 from simpel_cli.config import Job, dump
-from simpel_cli.console import Terminal
 from simpel_cli.errors import ConfigError
 from simpel_cli.nodes import build
-from simpel_cli.records import write_table, write_text
-from simpel_cli.run import Manifest, make_directory, refuse_occupied
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.manifest import Manifest
 from simulators.worlds.simulate import Simulate
 
 

@@ -18,7 +18,7 @@ from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
 from simpel_cli.nodes import build
 from simpel_cli.prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import Assembled, System, assemble, normaliser_of, system_of
-from simpel_cli.run import Settings, configure, stream
+from simpel_cli.runs.settings import Settings, configure, stream
 
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
 GROUPS = (

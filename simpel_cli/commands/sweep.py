@@ -12,14 +12,15 @@ from time import perf_counter
 from typing import Any
 
 from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
-from simpel_cli.commands.gather import Found, runs_below
 from simpel_cli.commands.job import Outcome, perform
 from simpel_cli.config import Job, count_jobs, first_job, launch, sweep_directory, value_of
-from simpel_cli.console import Board, Terminal
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
-from simpel_cli.interruption import interruption
 from simpel_cli.launcher import DaskLauncher
-from simpel_cli.run import locked, typed
+from simpel_cli.runs.console import Board, Terminal
+from simpel_cli.runs.directory import typed
+from simpel_cli.runs.finding import Found, runs_below
+from simpel_cli.runs.interruption import interruption
+from simpel_cli.runs.lock import locked
 
 LOOK = 0.2  # s between two looks at what has ended
 GRACE = 300.0  # s that running jobs have to save their state

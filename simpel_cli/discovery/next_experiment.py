@@ -24,7 +24,7 @@ from simpel_cli.discovery.fit import Lane
 from simpel_cli.discovery.search import TIE, Search, Trial
 from simpel_cli.discovery.selection import Selection
 from simpel_cli.discovery.twins import twins
-from simpel_cli.records import write_text
+from simpel_cli.runs.files import write_text
 
 FILE = "next_experiment.csv"
 LOUDER = (1.0, 1.5, 2.5, 5.0, 15.0, 100.0)  # factors on the process noise that a member may resort to

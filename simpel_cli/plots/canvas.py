@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.records import read_table, replacing
+from simpel_cli.runs.files import read_table, replacing
 
 # colour-blind safe (Okabe and Ito 2008)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

@@ -17,7 +17,8 @@ from simpel_cli.plots.canvas import (
     units_of,
     with_unit,
 )
-from simpel_cli.records import read_metrics, replacing
+from simpel_cli.runs.files import replacing
+from simpel_cli.runs.metrics import read_metrics
 
 SHOWN = 20  # paths of episodes
 FRAMES = 100

@@ -19,7 +19,7 @@ from simpel_cli.plots.canvas import (
     save,
     with_unit,
 )
-from simpel_cli.records import read_metrics
+from simpel_cli.runs.metrics import read_metrics
 
 MOST_POINTS = 200  # of a panel: more of them is a band of ink
 

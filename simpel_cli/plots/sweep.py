@@ -8,7 +8,7 @@ import numpy as np
 
 from simpel_cli.evaluation.comparison import METRICS, Point, by_seed, points
 from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, ratio_scale, save
-from simpel_cli.records import read_metrics
+from simpel_cli.runs.metrics import read_metrics
 
 FARTHEST = 5.0  # a line that would stretch the axis more than so many times is not followed
 LEAST_SPAN = 1.0  # nat; differences below are small however the lines lie

@@ -9,10 +9,10 @@ import numpy as np
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import DataError
-from simpel_cli.records import read_table
 from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Goal, Task
+from simpel_cli.runs.files import read_table
 from simulators.quantity import Quantity
 
 POLL = 0.2  # s

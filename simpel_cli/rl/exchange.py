@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from simpel_cli.errors import DataError
-from simpel_cli.records import write_text
 from simpel_cli.rl.answers import POLL, Answers
 from simpel_cli.rl.plant import Ride
+from simpel_cli.runs.files import write_text
 
 
 class Exchange:

@@ -10,10 +10,11 @@ import numpy as np
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.records import read_arrays, write_arrays, write_text
 from simpel_cli.rl import runner
 from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.task import Goal
+from simpel_cli.runs.arrays import read_arrays, write_arrays
+from simpel_cli.runs.files import write_text
 
 
 def contract(encoding: Encoding, goal: Goal, memory: int, dt: float) -> dict[str, Any]:

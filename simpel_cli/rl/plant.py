@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import DataError
-from simpel_cli.records import write_table
 from simpel_cli.rl.files import load_policy
 from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.rollout import Episodes, episodes, reflex
 from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.task import Goal
 from simpel_cli.rl.world import World
+from simpel_cli.runs.files import write_table
 
 LEAST_ROWS = 2  # of an episode: one transition
 

@@ -19,7 +19,7 @@ from simpel_cli.nodes import build
 from simpel_cli.places import conf_dir, recordings_dir
 from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.problem import Assembled, assemble, normaliser_of, system_of
-from simpel_cli.run import stream
+from simpel_cli.runs.settings import stream
 
 STEPS = {20: 5000, 50: 5000, 320: 7000, 400: 8000}  # of the reference, per training size
 SIMULATORS = {"pendulum": "pendulum_published", "rc_car": "rc_car"}

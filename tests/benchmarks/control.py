@@ -30,7 +30,7 @@ from simpel_cli.rl.policy import Policy
 from simpel_cli.rl.rollout import Controller, episodes, reflex
 from simpel_cli.rl.sac import SAC, Rule
 from simpel_cli.rl.world import World, true_world
-from simpel_cli.run import Settings, configure
+from simpel_cli.runs.settings import Settings, configure
 from simpel_cli.transition import encoding_of, transition
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from simpel_cli.records import write_table, write_text
+from simpel_cli.runs.files import write_table, write_text
 from tests.benchmarks.cost import searched
 
 

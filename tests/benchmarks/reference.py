@@ -20,8 +20,8 @@ from scipy.stats import t
 from simpel_cli import loop
 from simpel_cli.commands.study import STRETCH
 from simpel_cli.evaluation import Posterior, one_step
-from simpel_cli.records import write_table
-from simpel_cli.run import Settings, configure
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.settings import Settings, configure
 from tests.benchmarks.arrays import METHODS, SCORES, Case, case, folder, sets
 
 KEYS = ("nll", "rmse", "crps", "coverage_90")

@@ -24,8 +24,8 @@ from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays
 from simpel_cli.plots.canvas import COLOURS, new_figure, save
 from simpel_cli.problem import assemble
-from simpel_cli.records import write_table
-from simpel_cli.run import stream
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.settings import stream
 
 MOST_TESTED = 64  # inputs at which the posterior is looked at
 

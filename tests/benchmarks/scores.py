@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.inference import ScoreEstimator
-from simpel_cli.records import write_table
-from simpel_cli.run import Settings, configure
+from simpel_cli.runs.files import write_table
+from simpel_cli.runs.settings import Settings, configure
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod

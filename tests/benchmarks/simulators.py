@@ -29,7 +29,7 @@ def measured(name: str) -> dict[str, float]:
     from simpel_cli.nodes import build
     from simpel_cli.prior import SimulatorPrior
     from simpel_cli.problem import system_of
-    from simpel_cli.run import Settings, configure
+    from simpel_cli.runs.settings import Settings, configure
 
     configure(Settings(cache=False))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

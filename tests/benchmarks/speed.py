@@ -74,7 +74,7 @@ def measured(given: dict[str, Any], stretches: int, started: float) -> dict[str,
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from simpel_cli import loop
     from simpel_cli.commands.study import STRETCH
-    from simpel_cli.run import Settings, configure
+    from simpel_cli.runs.settings import Settings, configure
     from tests.benchmarks.arrays import case
 
     configure(Settings())
@@ -129,7 +129,7 @@ def main() -> None:
     if options.case:
         print(json.dumps(measured(json.loads(options.case), options.stretches, options.started)))
         return
-    from simpel_cli.records import write_table
+    from simpel_cli.runs.files import write_table
 
     cases = {k: v for k, v in GROUPS[options.group].items() if not options.only or any(w in k for w in options.only)}
     found: dict[str, list[dict[str, float]]] = {name: [] for name in cases}

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from simpel_cli.rl.sac import SAC
 from simpel_cli.rl.task import Judged
 from simpel_cli.rl.world import Situation, Step, World
-from simpel_cli.run import Settings, configure
+from simpel_cli.runs.settings import Settings, configure
 
 OBSERVATIONS, ACTIONS, UPDATES = 13, 2, 2000
 BATCHES = (64, 256)

@@ -21,8 +21,9 @@ import scipy.stats
 from simpel_cli.config import launch
 from simpel_cli.errors import SimpelError
 from simpel_cli.plots.canvas import legend_below, line_style, new_figure, ratio_scale, save
-from simpel_cli.records import read_metrics, write_table, write_text
-from simpel_cli.run import read_manifest
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.manifest import read_manifest
+from simpel_cli.runs.metrics import read_metrics
 
 CONF = Path(__file__).parent / "conf"
 METRICS = ("nll", "nll_sum", "nrmse")

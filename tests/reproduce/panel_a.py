@@ -16,7 +16,7 @@ import numpy as np
 
 from simpel_cli.commands.simulate import simulate
 from simpel_cli.config import launch
-from simpel_cli.records import write_text
+from simpel_cli.runs.files import write_text
 from tests.reproduce.panel import (
     CONF,
     SPREAD,

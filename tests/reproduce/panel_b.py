@@ -10,7 +10,7 @@ box and draws as in panel (a).
 
 import numpy as np
 
-from simpel_cli.records import write_text
+from simpel_cli.runs.files import write_text
 from tests.reproduce.panel import (
     SPREAD,
     Fit,

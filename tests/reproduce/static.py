@@ -17,8 +17,8 @@ from simpel_cli.nodes import build
 from simpel_cli.places import conf_dir
 from simpel_cli.prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import System, assemble, system_of
-from simpel_cli.records import write_table, write_text
-from simpel_cli.run import Settings, configure, stream
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.settings import Settings, configure, stream
 
 SEEDS = 5
 DRAWS = 256

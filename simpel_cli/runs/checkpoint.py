@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.records import load_checkpoint, save_checkpoint
+from simpel_cli.runs.arrays import load_checkpoint, save_checkpoint
 
 
 def keep(directory: Path, tree: Any, facts: dict[str, Any]) -> None:
