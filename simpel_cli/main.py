@@ -17,7 +17,7 @@ from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.runs.interruption import never_lost
 
 if TYPE_CHECKING:
-    from simpel_cli.config import Job
+    from simpel_cli.config.launch import Job
 
 # at the end Python looks for cycles among all that JAX has made, for nothing: of a fit's 9 s, the last 0.8
 atexit.register(gc.freeze)
@@ -50,14 +50,14 @@ def _simpel(
 
 
 def _completed(context: typer.Context, incomplete: str) -> list[str]:
-    from simpel_cli.completion import overrides
+    from simpel_cli.config.completion import overrides
 
     return overrides(context, incomplete)
 
 
 def _option_of(group: str) -> Callable[[typer.Context, str], list[str]]:
     def complete(context: typer.Context, incomplete: str) -> list[str]:
-        from simpel_cli.config import options
+        from simpel_cli.config.groups import options
 
         return [name for name in options(group, context.params.get("config_dir")) if name.startswith(incomplete)]
 
@@ -362,7 +362,7 @@ def _launch(
 
         every(verb, overrides or [], config_dir, cfg)
         return
-    from simpel_cli.config import launch
+    from simpel_cli.config.launch import launch
 
     launch(verb, task, overrides or [], config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from command_line import rig
 
-from simpel_cli.completion import candidates
-from simpel_cli.config import options
+from simpel_cli.config.completion import candidates
+from simpel_cli.config.groups import options
 
 
 @pytest.mark.parametrize(

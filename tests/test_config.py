@@ -11,10 +11,10 @@ from command_line import ROOT, simpel
 from omegaconf import OmegaConf
 
 from simpel_cli.commands.study import Evaluation
-from simpel_cli.config import checked, count_jobs
+from simpel_cli.config.nodes import build
+from simpel_cli.config.overrides import checked, count_jobs
+from simpel_cli.config.places import conf_dir
 from simpel_cli.data import Measurements
-from simpel_cli.nodes import build
-from simpel_cli.places import conf_dir
 from simpel_cli.runs.settings import Settings
 from simulators.built import Built
 from simulators.model import Model
@@ -107,7 +107,7 @@ OWN_TO_THE_SYSTEM = {"Declared", "MujocoWorld", "CallableWorld", "Measurements"}
 )
 def test_leaves_list_every_field(path: Path) -> None:
     """What can be set stands in the YAML with its value: users read it there."""
-    from simpel_cli.nodes import _resolve
+    from simpel_cli.config.nodes import _resolve
 
     def check(node: Mapping, where: str) -> None:
         if "_target_" in node:

@@ -14,10 +14,10 @@ import pytest
 import yaml
 from command_line import ROOT, simpel
 
+from simpel_cli.config.nodes import build
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.nets import MLP
-from simpel_cli.nodes import build
 from simpel_cli.rl.files import contract, load_policy, save_policy
 from simpel_cli.rl.fine_tune import fading, fine_tuned, finite
 from simpel_cli.rl.planner import ICEM

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import yaml
 
+from simpel_cli.config.nodes import build
+from simpel_cli.config.places import conf_dir
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery import corrected as module
 from simpel_cli.discovery.augmented import augment
 from simpel_cli.discovery.fit import Optimum
 from simpel_cli.discovery.search import Search, Trial
 from simpel_cli.discovery.setup import terms_of
-from simpel_cli.nodes import build
-from simpel_cli.places import conf_dir
 from simulators.effects import Scales, Term
 
 CASES = {

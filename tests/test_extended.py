@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from systems import whole_node
 
+from simpel_cli.config.nodes import build
 from simpel_cli.errors import ConfigError
-from simpel_cli.nodes import build
 from simulators.model import Model, ModelError
 
 

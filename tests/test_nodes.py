@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from simpel_cli.config.nodes import build
 from simpel_cli.errors import ConfigError
-from simpel_cli.nodes import build
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,11 @@ class TestBuild:
 
     @pytest.mark.parametrize(
         "target",
-        ["simpel_cli.nodes.importlib.import_module", "simulators.model.casadi.SX", "simpel_cli.runs.lock.os.system"],
+        [
+            "simpel_cli.config.nodes.importlib.import_module",
+            "simulators.model.casadi.SX",
+            "simpel_cli.runs.lock.os.system",
+        ],
     )
     def test_fence_holds_for_what_a_module_imports(self, target: str) -> None:
         with pytest.raises(ConfigError, match=r"cannot import|is not a dataclass"):

@@ -22,12 +22,12 @@ from command_line import ROOT, simpel
 from simpel_cli.commands.control import assignment, world_of_posterior
 from simpel_cli.commands.fit import learned
 from simpel_cli.commands.study import settings_of
-from simpel_cli.config import load
+from simpel_cli.config.nodes import build
+from simpel_cli.config.resolved import load
 from simpel_cli.data import Measurements, read
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.nets import MLP
-from simpel_cli.nodes import build
 from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import contract, load_policy, save_policy

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.config import load, options
+from simpel_cli.config.groups import options
+from simpel_cli.config.resolved import load
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
 from simpel_cli.runs.console import Terminal, aligned
 from simulators.quantity import ModelError
@@ -83,7 +84,7 @@ def effects(name: str | None, config_dir: Path | None) -> None:
 
 
 def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> None:
-    from simpel_cli import nodes
+    from simpel_cli.config import nodes
 
     try:
         model = nodes.build(entry.node, "sim", plugins).model()

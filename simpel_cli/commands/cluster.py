@@ -24,7 +24,7 @@ import dask.utils
 from distributed import Client, LocalCluster, WorkerPlugin
 
 from simpel_cli.commands.job import Outcome, perform
-from simpel_cli.config import Job
+from simpel_cli.config.launch import Job
 from simpel_cli.errors import ConfigError, did_you_mean
 
 MEMORY_EACH = 2.5e9  # bytes of a job, about

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.config import swept_keys
+from simpel_cli.config.overrides import swept_keys
 from simpel_cli.errors import ConfigError, SimpelError
 from simpel_cli.plots import draw_sweep
 from simpel_cli.runs.console import Terminal

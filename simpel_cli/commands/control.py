@@ -13,11 +13,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli import loop
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
+from simpel_cli.config.nodes import build
 from simpel_cli.data.recording import Source
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
-from simpel_cli.nodes import build
 from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned

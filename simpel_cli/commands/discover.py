@@ -13,7 +13,9 @@ import numpy as np
 from simpel_cli.commands.close import close, memory_of
 from simpel_cli.commands.discover_show import publish
 from simpel_cli.commands.study import open_study, refuse_untested, resolved, settings_of
-from simpel_cli.config import Job, dump
+from simpel_cli.config.launch import Job
+from simpel_cli.config.nodes import build
+from simpel_cli.config.resolved import dump
 from simpel_cli.discovery.assess import Assessor
 from simpel_cli.discovery.cleaned import Cleaned, cleaned, outlier_check
 from simpel_cli.discovery.corrected import corrected
@@ -37,7 +39,6 @@ from simpel_cli.discovery.unseen import caveats, unseen
 from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.discovery.windows import Windows
 from simpel_cli.errors import ConfigError, Inconclusive
-from simpel_cli.nodes import build
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import strict, write_table, write_text

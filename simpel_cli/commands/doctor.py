@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.config import load
+from simpel_cli.config.places import conf_dir, recordings_dir
+from simpel_cli.config.resolved import load
 from simpel_cli.errors import SimpelError
-from simpel_cli.places import conf_dir, recordings_dir
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.manifest import versions
 from simpel_cli.runs.settings import Settings, cache_directory, configure
@@ -134,7 +134,7 @@ def _simulator() -> tuple[bool, str]:
     import jax
     import jax.numpy as jnp
 
-    from simpel_cli import nodes
+    from simpel_cli.config import nodes
     from simpel_cli.transition import encoding_of, transition
 
     model = nodes.build(load(conf_dir() / "sim" / "pendulum.yaml"), "sim").model()

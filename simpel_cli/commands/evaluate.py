@@ -9,7 +9,8 @@ from simpel_cli.commands.judge import judge
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe_data, publish
 from simpel_cli.commands.study import Study, open_study, posteriors, prepare, resolved, settings_of
-from simpel_cli.config import Job, dump, of_run
+from simpel_cli.config.launch import Job
+from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.data import Check
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.runs.console import Terminal

@@ -18,11 +18,11 @@ import casadi
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.config import dump, load, of_run
+from simpel_cli.config.nodes import build
+from simpel_cli.config.resolved import dump, load, of_run
 from simpel_cli.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
-from simpel_cli.nodes import build
 from simpel_cli.runs.arrays import load_checkpoint, write_arrays
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, typed

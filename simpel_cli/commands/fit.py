@@ -13,7 +13,8 @@ from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
-from simpel_cli.config import Job, dump, of_run
+from simpel_cli.config.launch import Job
+from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal

@@ -19,7 +19,8 @@ from simpel_cli.commands.control import (
 )
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.study import open_study, resolved, settings_of
-from simpel_cli.config import Job, dump, of_run
+from simpel_cli.config.launch import Job
+from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError
 from simpel_cli.plots.canvas import with_interval
 from simpel_cli.plots.control import draw_control

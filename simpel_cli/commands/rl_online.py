@@ -16,10 +16,11 @@ from simpel_cli.commands.control import Assignment, Flown, assignment, remarks, 
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.rl_offline import OWN, done_steps, saved_policies
 from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
-from simpel_cli.config import Job, dump, of_run
+from simpel_cli.config.launch import Job
+from simpel_cli.config.nodes import build
+from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
-from simpel_cli.nodes import build
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online
 from simpel_cli.report import figure, write_report

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from simpel_cli.commands.study import settings_of, source_of
-from simpel_cli.config import Job, dump
+from simpel_cli.config.launch import Job
+from simpel_cli.config.nodes import build
+from simpel_cli.config.resolved import dump
 from simpel_cli.errors import ConfigError
-from simpel_cli.nodes import build
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_table, write_text

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from simpel_cli.config import Job
+from simpel_cli.config.launch import Job
+from simpel_cli.config.nodes import build
 from simpel_cli.data import Measurements, Recording, absolute, no_transitions, read, select, transitions
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
-from simpel_cli.nodes import build
 from simpel_cli.prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import Assembled, System, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import Settings, configure, stream

@@ -13,9 +13,10 @@ from typing import Any
 
 from simpel_cli.commands.collect import RECORD, Record, collect, headline, read_record, write_record
 from simpel_cli.commands.job import Outcome, perform
-from simpel_cli.config import Job, count_jobs, first_job, launch, sweep_directory, value_of
+from simpel_cli.config.launch import Job, launch, sweep_directory
+from simpel_cli.config.launcher import DaskLauncher
+from simpel_cli.config.overrides import count_jobs, first_job, value_of
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
-from simpel_cli.launcher import DaskLauncher
 from simpel_cli.runs.console import Board, Terminal
 from simpel_cli.runs.directory import typed
 from simpel_cli.runs.finding import Found, runs_below

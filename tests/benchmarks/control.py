@@ -23,7 +23,7 @@ import optax
 import yaml
 
 from simpel_cli import loop
-from simpel_cli.nodes import build
+from simpel_cli.config.nodes import build
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy

@@ -19,7 +19,7 @@ import numpy as np
 
 from simpel_cli import loop
 from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, prepare, resolved
-from simpel_cli.config import Job, launch
+from simpel_cli.config.launch import Job, launch
 from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays
 from simpel_cli.plots.canvas import COLOURS, new_figure, save

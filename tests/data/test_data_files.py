@@ -8,9 +8,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from simpel_cli.config.nodes import build
 from simpel_cli.data import Measurements, Recording, absolute, read, transitions
 from simpel_cli.errors import ConfigError, DataError
-from simpel_cli.nodes import build
 from simulators.model import Declared
 
 DECAY = Declared(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.commands.simulate import simulate
-from simpel_cli.config import launch
+from simpel_cli.config.launch import launch
 from simpel_cli.runs.files import write_text
 from tests.reproduce.panel import (
     CONF,

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.config import BROUGHT, CONTROL, defaults_of, group_of, load, options
+from simpel_cli.config.groups import BROUGHT, CONTROL, defaults_of, group_of, options
+from simpel_cli.config.resolved import load
 from simpel_cli.errors import SimpelError
 
 
