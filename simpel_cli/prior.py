@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.dynamics.transition import OneStep, Transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.gp import Kernel, SquaredExponential, gram
-from simpel_cli.transition import OneStep, Transition
 from simulators.model import Quantity
 
 WIDE = 64  # numbers in a transition

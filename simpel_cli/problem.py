@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from simpel_cli.blow_up import blown_up
-from simpel_cli.domain import Domain
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.divergence import divergence_error
+from simpel_cli.dynamics.domain import Domain
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import Transition, encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.likeliest import TYPICAL_SCALE, noise_of_smooth
 from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
-from simpel_cli.transition import Transition, encoding_of, transition
 from simulators.model import Model
 from simulators.parameters import draw
 from simulators.worlds.world import World
@@ -62,7 +62,7 @@ class System(NamedTuple):
             if not np.isfinite(values).all():
                 # the same key draws the same parameters again
                 phi = np.asarray(sample_parameters(key, self.transition.params, n, jnp.dtype(jnp.float64)))
-                raise blown_up(self.source, self.encoding, x, phi, values)
+                raise divergence_error(self.source, self.encoding, x, phi, values)
             return values
         assert not isinstance(self.source, Model)
         return query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
@@ -94,7 +94,7 @@ def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) ->
     m = len(x)
     after = world.step(np.tile(states, (n, 1)), np.tile(inputs, (n, 1)), np.repeat(phi, m, axis=0))
     if not np.isfinite(after).all():
-        raise blown_up(world, encoding, x, phi, after.reshape(n, m, -1))
+        raise divergence_error(world, encoding, x, phi, after.reshape(n, m, -1))
     targets = encoding.to_y(np.tile(states, (n, 1)), after, np.zeros((n * m, 0)))
     return targets.reshape(n, m, -1)
 

@@ -2,8 +2,8 @@
 
 import casadi
 
+from simulators.input_delay import delayed_inputs
 from simulators.model import Model
-from simulators.signals import arriving
 
 
 def one_step(model: Model) -> casadi.Function:
@@ -27,7 +27,7 @@ def one_step(model: Model) -> casadi.Function:
         return casadi.Function(f"{model.name}_step", [x, u, p], [casadi.MX(0, 1), y], *names)
     flow, h = model.flow(), model.dt / model.substeps
     z = flow.enter(x, p) if flow.enter is not None else x
-    for held in arriving(model, u, p):
+    for held in delayed_inputs(model, u, p):
         k1 = flow.rhs(z, held, p)
         k2 = flow.rhs(z + h / 2 * k1, held, p)
         k3 = flow.rhs(z + h / 2 * k2, held, p)

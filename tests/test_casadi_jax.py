@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli import casadi_operations
-from simpel_cli.casadi_jax import ConversionError, _feeds_branch, _Step, checked, to_jax
+from simpel_cli.dynamics import casadi_operations
+from simpel_cli.dynamics.casadi_jax import ConversionError, _feeds_branch, _Step, checked, to_jax
 from simpel_cli.errors import ConfigError
 
 SCALAR: dict[str, Callable[..., casadi.SX]] = {

@@ -15,7 +15,8 @@ import yaml
 from command_line import ROOT, simpel
 
 from simpel_cli.config.nodes import build
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.nets import MLP
 from simpel_cli.rl.files import contract, load_policy, save_policy
@@ -28,7 +29,6 @@ from simpel_cli.rl.runner import PolicyRunner
 from simpel_cli.rl.sac import SAC, Scaler
 from simpel_cli.rl.task import Judged, Task
 from simpel_cli.rl.world import Situation, Step, World, beginning_at, learned_world, true_world
-from simpel_cli.transition import encoding_of, transition
 from simulators.model import Quantity
 from simulators.worlds.rk4 import RK4
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.domain import Domain
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.domain import Domain
+from simpel_cli.dynamics.encoding import Encoding
 from simulators.model import Quantity
 
 # an angle between two plain states: order matters

@@ -10,7 +10,8 @@ from scipy.stats import chi2, norm
 from systems import model
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.evaluation import (
     CHUNK,
     Blocks,
@@ -25,7 +26,6 @@ from simpel_cli.evaluation import (
     windows,
 )
 from simpel_cli.predictive import Predictive
-from simpel_cli.transition import encoding_of, transition
 from simulators.model import Quantity
 
 N, DY = 3000, 2

@@ -17,7 +17,7 @@ from command_line import FIT, TINY, rig, simpel
 from simpel_cli.config import nodes
 from simpel_cli.config.places import conf_dir
 from simpel_cli.config.resolved import GROUPS, load
-from simpel_cli.transition import encoding_of, transition
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators.model import Model
 from simulators.step import one_step
 

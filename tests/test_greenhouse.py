@@ -12,7 +12,7 @@ import pytest
 from systems import model, whole_node
 
 from simpel_cli.config.nodes import build
-from simpel_cli.transition import encoding_of, transition
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators import greenhouse as physics
 from simulators.model import Model, ModelError
 from simulators.parameters import draw

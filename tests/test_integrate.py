@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.integrate import rk4_step
+from simpel_cli.dynamics.integrate import rk4_step
 
 START, DURATION = np.array([0.3, 0.4]), 1.5
 

@@ -25,7 +25,8 @@ from simpel_cli.commands.study import settings_of
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import load
 from simpel_cli.data import Measurements, read
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.nets import MLP
 from simpel_cli.rl.answers import Answers
@@ -41,7 +42,6 @@ from simpel_cli.rl.world import true_world
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics
 from simpel_cli.runs.settings import stream
-from simpel_cli.transition import encoding_of, transition
 
 HORIZON = 12
 FLOAT32 = jnp.dtype("float32")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from systems import model
 
-from simpel_cli.transition import encoding_of, transition
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators.model import Model, ModelError
 from simulators.racecar import Body, RaceCar, slip_angles
 from simulators.worlds.rk4 import RK4

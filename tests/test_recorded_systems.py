@@ -10,7 +10,7 @@ import pytest
 from command_line import TINY, rig, simpel
 from systems import model
 
-from simpel_cli.transition import encoding_of, transition
+from simpel_cli.dynamics.transition import encoding_of, transition
 
 EXPERIMENTS = ("rc_car", "emps", "cascaded_tanks", "ball_drops", "free_pendulum")
 

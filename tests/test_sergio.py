@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from systems import model
 
-from simpel_cli.transition import encoding_of, transition
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators.model import Model, ModelError
 from simulators.parameters import draw
 from simulators.sergio import Genes, Sergio, rate

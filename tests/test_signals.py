@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.signals import arriving, play
+from simpel_cli.dynamics.input_delay import delayed_inputs, play
 
 DT, SUBSTEPS, LEAD = 0.1, 4, 8
 U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
 
 
 def arrived(delay: float, lag: float, u: np.ndarray = U) -> np.ndarray:
-    out = arriving(jnp.asarray(u), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
+    out = delayed_inputs(jnp.asarray(u), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
     return np.asarray(out)[..., 0]
 
 
@@ -57,7 +57,7 @@ def test_a_lag_is_the_solution_of_its_equation(lag: float) -> None:
 @pytest.mark.parametrize("at", [(0.137, 0.0), (0.06, 0.2), (0.313, 0.07)])
 def test_derivatives_are_those_of_differences(at: tuple[float, float]) -> None:
     def total(times: jax.Array) -> jax.Array:
-        out = arriving(jnp.asarray(U), times[:1], times[1:], dt=DT, substeps=SUBSTEPS, lead=LEAD)
+        out = delayed_inputs(jnp.asarray(U), times[:1], times[1:], dt=DT, substeps=SUBSTEPS, lead=LEAD)
         return jnp.sum(out * jnp.arange(out.size, dtype=out.dtype).reshape(out.shape))
 
     gradient = np.asarray(jax.grad(total)(jnp.array(at)))
@@ -89,7 +89,7 @@ def test_a_play_is_crossed_once_per_reversal() -> None:
 
 
 def test_a_play_comes_before_delay_and_lag() -> None:
-    both = arriving(
+    both = delayed_inputs(
         jnp.asarray(U), jnp.array([0.137]), jnp.array([0.2]), dt=DT, substeps=SUBSTEPS, lead=LEAD,
         half_play=jnp.array([0.4]),
     )  # fmt: skip
@@ -113,7 +113,7 @@ def test_a_delay_of_whole_rows_is_that_however_it_is_compiled(rows: int) -> None
     late = jnp.full(2, rows * 0.1 / 3, jnp.float32)
 
     def arrived(u: jax.Array, delay: jax.Array) -> jax.Array:
-        return arriving(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0]
+        return delayed_inputs(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0]
 
     found = jax.jit(jax.vmap(arrived, in_axes=(0, None)))(inputs, late)
     np.testing.assert_allclose(found, np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=5e-6)

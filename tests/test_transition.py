@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from systems import SYMBOLIC, model
 
-from simpel_cli.casadi_jax import to_jax
-from simpel_cli.domain import Domain
+from simpel_cli.dynamics.casadi_jax import to_jax
+from simpel_cli.dynamics.domain import Domain
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.transition import encoding_of, transition
 from simulators.model import Declared, Model
 from simulators.parameters import draw
 

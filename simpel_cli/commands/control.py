@@ -15,7 +15,8 @@ from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
 from simpel_cli.config.nodes import build
 from simpel_cli.data.recording import Source
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import Problem
 from simpel_cli.rl.comparable import check_comparable
@@ -32,7 +33,6 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.settings import Settings, stream
-from simpel_cli.transition import encoding_of, transition
 from simulators.model import Model
 
 Judge = Callable[[Policy, PRNGKeyArray], Episodes]  # leaves of the policy (runs, ...)

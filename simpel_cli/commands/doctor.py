@@ -135,7 +135,7 @@ def _simulator() -> tuple[bool, str]:
     import jax.numpy as jnp
 
     from simpel_cli.config import nodes
-    from simpel_cli.transition import encoding_of, transition
+    from simpel_cli.dynamics.transition import encoding_of, transition
 
     model = nodes.build(load(conf_dir() / "sim" / "pendulum.yaml"), "sim").model()
     encoding = encoding_of(model)

@@ -20,7 +20,7 @@ import numpy as np
 
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump, load, of_run
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
 from simpel_cli.runs.arrays import load_checkpoint, write_arrays

@@ -9,7 +9,7 @@ import numpy as np
 from simpel_cli import evaluation as ev
 from simpel_cli.commands.study import Study, refuse_untested
 from simpel_cli.data import Episode, Places, origins, places, transitions
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.runs.files import write_table
 
 MOST_RUNS = 100  # free runs whose course is kept

@@ -19,6 +19,11 @@ def options(group: str, config_dir: Path | None = None) -> dict[str, Path]:
 
 
 def user_conf(config_dir: Path | None) -> Path | None:
+    """Return the folder of the user's groups: the given one, or `conf/` inside it.
+
+    Raises:
+        ConfigError: it is no folder.
+    """
     if config_dir is None:
         return None
     if not config_dir.is_dir():

@@ -134,7 +134,7 @@ def _window(
 ) -> tuple[Track, Array, Array]:
     p, noise = Coordinates.of(bounds, layout).physical(z)
     track, _ = rule.track(p, noise, y, ok, u, start, spread)
-    u_sub = rule.arriving(p, u)
+    u_sub = rule.delayed_inputs(p, u)
     rows = y.shape[0]
 
     def step(x: Array, k: Array) -> tuple[Array, None]:

@@ -30,7 +30,7 @@ from simpel_cli.discovery.augmented import Augmented
 from simpel_cli.discovery.late_sensors import back, echo, no_jumps, pushed
 from simpel_cli.discovery.points import along, apart, product
 from simpel_cli.discovery.slopes import Value, movable, with_slope
-from simpel_cli.signals import arriving
+from simpel_cli.dynamics.input_delay import delayed_inputs
 from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
 
@@ -72,7 +72,7 @@ class Filter(NamedTuple):
         louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
         flow: (p, x, u of the substeps) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
-        arriving: (p, u) -> inputs as they arrive, (T, substeps, nu).
+        delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, nu).
     """
 
     track: Callable[..., tuple[Track, Held]]
@@ -80,7 +80,7 @@ class Filter(NamedTuple):
     louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
-    arriving: Callable[..., Float[Array, "T substeps nu"]]
+    delayed_inputs: Callable[..., Float[Array, "T substeps nu"]]
 
 
 class Moving(NamedTuple):
@@ -156,7 +156,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         widths = (per_signal(p, plays, nu),) if plays else ()
 
         def one(u: Array, delay: Array, lag: Array, *play: Array) -> Array:
-            return arriving(u, delay, lag, dt=dt, substeps=substeps, lead=lead, half_play=play[0] if play else None)
+            return delayed_inputs(
+                u, delay, lag, dt=dt, substeps=substeps, lead=lead, half_play=play[0] if play else None
+            )
 
         return _over_points(one, p.ndim - 1)(u, *times, *widths)
 

@@ -136,5 +136,5 @@ class Forces:
 def _programs(rule: Filter) -> tuple[Any, Any]:
     return (
         jax.jit(jax.vmap(rule.flow, in_axes=(None, 0, 0))),
-        jax.jit(jax.vmap(rule.arriving, in_axes=(None, 0))),
+        jax.jit(jax.vmap(rule.delayed_inputs, in_axes=(None, 0))),
     )

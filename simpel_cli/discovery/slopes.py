@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from simpel_cli.casadi_jax import checked, to_jax_rows
 from simpel_cli.discovery.augmented import Augmented
+from simpel_cli.dynamics.casadi_jax import checked, to_jax_rows
 
 if TYPE_CHECKING:
     from simpel_cli.discovery.filter import Moving

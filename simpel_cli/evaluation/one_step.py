@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import CHUNK, Posterior
 from simpel_cli.predictive import Predictive

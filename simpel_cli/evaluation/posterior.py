@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from simpel_cli.data.recording import Transitions
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.predictive import Predictive
 
 CHUNK = 512  # test inputs per call: one compiled program serves every test set

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import DataError
 from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
 from simpel_cli.rl.runner import PolicyRunner

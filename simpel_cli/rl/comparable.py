@@ -2,7 +2,7 @@
 
 import math
 
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.rl.task import Goal
 from simulators.model import Model

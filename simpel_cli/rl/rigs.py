@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.task import Goal

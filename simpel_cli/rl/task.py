@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from simpel_cli.casadi_jax import checked
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.casadi_jax import checked
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.expression import ExpressionError, parse, symbols_used
 from simulators.quantity import Quantity

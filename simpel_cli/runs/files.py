@@ -51,10 +51,11 @@ def write_table(path: Path, columns: dict[str, Any], units: Mapping[str, str] | 
 
     table = pa.Table.from_pydict(columns)
     fields = [f.with_metadata({"unit": units[f.name]}) if units and f.name in units else f for f in table.schema]
-    _write_parquet(path, table.cast(pa.schema(fields)))
+    write_parquet(path, table.cast(pa.schema(fields)))
 
 
-def _write_parquet(path: Path, table: Any) -> None:
+def write_parquet(path: Path, table: Any) -> None:
+    """Write an Arrow table atomically, with checksums of its pages."""
     import pyarrow.parquet as pq
 
     with replacing(path) as temporary:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.runs.files import _write_parquet, read_table, write_text
+from simpel_cli.runs.files import read_table, write_parquet, write_text
 from simpel_cli.runs.tensorboard import Scalars
 
 COLUMNS = (
@@ -89,7 +89,7 @@ def write_metrics(path: Path, rows: list[dict[str, Any]], constants: dict[str, A
     types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64()}
     schema = pa.schema([(name, types[kind]) for name, kind in COLUMNS])
     table = pa.table({n: pa.array([(constants | r).get(n) for r in rows], types[k]) for n, k in COLUMNS}, schema=schema)
-    _write_parquet(path, table)
+    write_parquet(path, table)
     return path
 
 

@@ -24,6 +24,7 @@ import yaml
 
 from simpel_cli import loop
 from simpel_cli.config.nodes import build
+from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy
@@ -31,7 +32,6 @@ from simpel_cli.rl.rollout import Controller, episodes, reflex
 from simpel_cli.rl.sac import SAC, Rule
 from simpel_cli.rl.world import World, true_world
 from simpel_cli.runs.settings import Settings, configure
-from simpel_cli.transition import encoding_of, transition
 
 CONF = Path(__file__).parents[2] / "conf"
 HORIZONS = (200, 100)

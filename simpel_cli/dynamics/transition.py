@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from simpel_cli.casadi_jax import checked
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.casadi_jax import checked
+from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.input_delay import delayed_inputs
+from simpel_cli.dynamics.integrate import State, rk4_step
 from simpel_cli.errors import ConfigError
-from simpel_cli.integrate import State, rk4_step
-from simpel_cli.signals import arriving
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
 
@@ -86,7 +86,7 @@ def transition(model: Model, encoding: Encoding) -> Transition:
         assert integrated is not None
         if not (model.delay or model.lag):
             return integrated(state, jnp.broadcast_to(u, (model.substeps, n_inputs)), phi)
-        late = arriving(
+        late = delayed_inputs(
             stacked.reshape(encoding.stack + 1, n_inputs), seconds(model.delay, phi), seconds(model.lag, phi),
             dt=model.dt, substeps=model.substeps, lead=encoding.stack,
         )  # fmt: skip

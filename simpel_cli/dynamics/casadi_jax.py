@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from simpel_cli.casadi_operations import Program, Values, operation, projection, to_dense, to_nonzeros
+from simpel_cli.dynamics.casadi_operations import Program, Values, operation, projection, to_dense, to_nonzeros
 from simpel_cli.errors import ConfigError
 
 

@@ -8,7 +8,7 @@ from simulators.expression import Symbol
 from simulators.model import Model
 
 
-def arriving(model: Model, u: Symbol, p: Symbol) -> list[Symbol]:
+def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Symbol]:
     """Return the inputs (du, 1) of every substep of the last row.
 
     Args:

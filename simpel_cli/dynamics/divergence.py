@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from simpel_cli.encoding import Encoding
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
 
 
-def blown_up(
+def divergence_error(
     source: Model | World, encoding: Encoding, x: np.ndarray, phi: np.ndarray, values: np.ndarray
 ) -> ConfigError:
     """Return the error; it names one point: of the draw that fails most often, the one least far out in the ranges.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def arriving(
+def delayed_inputs(
     u: Float[Array, "R nu"],
     delay: Float[Array, " nu"],
     lag: Float[Array, " nu"],
