@@ -188,7 +188,7 @@ class NoiseModel:
         marginal_share: nor, where it is learned from no more than 512 transitions (128 of a world), below this share of
             the noise with the largest marginal likelihood under the method's prior, or the initial value if that is less;
             of a prior without a simulator, whose lengthscale may be short, not below what a smooth function leaves either
-            (`likeliest.py`). A network that goes through every one of a few points would else learn that there is no
+            (`priors.marginal_likelihood`). A network that goes through every one of a few points would else learn that there is no
             noise; where all functions that the prior allows are integrated out, it cannot. 0 switches that off.
         prior_std: standard deviation of log sigma under its prior.
         least_init: sigma_init is the larger of the data's noise and this.

@@ -17,10 +17,10 @@ from simpel_cli.dynamics.domain import Domain
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import Transition, encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import Bank, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
-from simpel_cli.likeliest import TYPICAL_SCALE, noise_of_smooth
-from simpel_cli.prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
+from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior, sample_parameters
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.marginal_likelihood import TYPICAL_SCALE, noise_of_smooth
 from simulators.model import Model
 from simulators.parameters import draw
 from simulators.worlds.world import World

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli import eigen
+from simpel_cli.priors import eigenvalues as eigen
 
 
 def matrices() -> jax.Array:

@@ -17,7 +17,7 @@ from simpel_cli import loop
 from simpel_cli.inference import NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.nets import MLP
-from simpel_cli.prior import GPPrior
+from simpel_cli.priors.function_prior import GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 
 OPTIMISED = {"xla_backend_optimization_level": 1}  # `make test` asks for 0, with which a step takes four times as long

@@ -6,8 +6,8 @@ import numpy as np
 import oracles
 import pytest
 
-from simpel_cli.gap import marginal_likelihood_scales
-from simpel_cli.gp import Kernel, Matern32, Matern52, Spectral, SquaredExponential, gram, posterior
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.gaussian_process import Kernel, Matern32, Matern52, Spectral, SquaredExponential, gram, posterior
 
 # Rasmussen and Williams (2006), eqs. 4.9 and 4.17, as functions of the distance r in lengthscales
 FORMULAS = [

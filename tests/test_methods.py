@@ -24,7 +24,7 @@ from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
 from simpel_cli.nets import MLP
 from simpel_cli.predictive import Predictive
-from simpel_cli.prior import FunctionPrior, GPPrior
+from simpel_cli.priors.function_prior import FunctionPrior, GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Quantity
 

@@ -12,12 +12,12 @@ from test_methods import EDGE, FIXED, GRID, NOISE, PARAMS, X, predicted, prior_o
 
 from simpel_cli.commands.show import used
 from simpel_cli.errors import ConfigError
-from simpel_cli.gp import SquaredExponential
 from simpel_cli.inference import Bank, Inference, NoiseModel, Normaliser, Problem, pad_rows, padded_length
-from simpel_cli.likeliest import evenly
 from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.nets import MLP
-from simpel_cli.prior import FunctionPrior
+from simpel_cli.priors.function_prior import FunctionPrior
+from simpel_cli.priors.gaussian_process import SquaredExponential
+from simpel_cli.priors.marginal_likelihood import evenly
 
 KAPPA, LENGTH = 0.5, 1.0
 FEW: dict[str, Any] = {"network": MLP((2,)), "batch": 4, "pool": 32, "features": 500}

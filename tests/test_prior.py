@@ -9,8 +9,8 @@ from systems import model
 
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.gp import Matern32
-from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior, sample_parameters
+from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior, sample_parameters
+from simpel_cli.priors.gaussian_process import Matern32
 from simulators.model import Quantity
 
 N = 40_000

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.gap import marginal_likelihood_scales
 from simpel_cli.inference import NoiseModel, padded_length
-from simpel_cli.likeliest import likeliest, noise_of_smooth, spectrum
-from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.marginal_likelihood import maximise_marginal_likelihood, noise_of_smooth, spectrum
 from simpel_cli.problem import (
     SCALE_DRAWS,
     SCALE_POINTS,
@@ -278,12 +278,12 @@ def test_a_short_lengthscale_in_many_dimensions_does_not_hide_the_noise():
     np.testing.assert_allclose(found, [0.2, 0.02], rtol=0.25)
     assert asked[0] == 1.0
     assert len(set(asked)) == len(asked)
-    own = likeliest(spectrum(correlation(1.0), jnp.asarray(y), given[0]), None, *given[1:]).noise
+    own = maximise_marginal_likelihood(spectrum(correlation(1.0), jnp.asarray(y), given[0]), None, *given[1:]).noise
     assert (np.abs(np.log(np.asarray(own) / [0.2, 0.02])) > np.log(1.4)).any()
 
 
 @pytest.mark.parametrize("gap", [None, 0.2])
-def test_the_likeliest_scales_have_no_likelier_neighbour(gap):
+def test_the_scales_of_largest_marginal_likelihood_have_no_likelier_neighbour(gap):
     """Against the density of a normal law, by scipy."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=60)

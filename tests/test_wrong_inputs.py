@@ -105,7 +105,7 @@ CASES = [
     case("unknown flag", "fit --steps 5", CONFIG, "No such option: --steps", "simpel fit --help"),
     case("unknown --cfg", "fit --cfg jobs", CONFIG, "got 'jobs'; allowed are job, hydra and all"),
     # targets
-    case("option of a wrong class", "fit prior.gap.kernel._target_=simpel_cli.gp.Matern12", CONFIG,
+    case("option of a wrong class", "fit prior.gap.kernel._target_=simpel_cli.priors.gaussian_process.Matern12", CONFIG,
          "prior.gap.kernel._target_", "Did you mean Matern52?", "SquaredExponential"),
     case("score as method", "fit method._target_=simpel_cli.scores.gaussian.Gaussian", CONFIG, "is no method"),
     case("removed _target_", "fit ~method._target_", CONFIG, "method: the key _target_ is missing"),

@@ -16,7 +16,7 @@ from simpel_cli.data import Measurements, Recording, absolute, no_transitions, r
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
-from simpel_cli.prior import GPPrior, SimulatorPrior
+from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import Assembled, System, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import Settings, configure, stream
 

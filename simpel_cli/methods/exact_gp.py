@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.gp import gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
-from simpel_cli.likeliest import Spectrum, likeliest, spectrum
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.predictive import Predictive
+from simpel_cli.priors.gaussian_process import gram
+from simpel_cli.priors.marginal_likelihood import Spectrum, maximise_marginal_likelihood, spectrum
 
 
 class State(NamedTuple):
@@ -87,7 +87,7 @@ class ExactGP:
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = spectrum(gram(kernel, known, known), left, problem.m)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = likeliest(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
+            best = maximise_marginal_likelihood(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
                 data,

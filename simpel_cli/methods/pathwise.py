@@ -23,13 +23,13 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.gp import Spectral, gram
 from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
-from simpel_cli.likeliest import MOST_ROWS, Spectrum, evenly, likeliest
 from simpel_cli.methods import networks as nets
 from simpel_cli.methods.networks import Networks, refuse_rates
 from simpel_cli.nets import MLP
-from simpel_cli.prior import FunctionPrior
+from simpel_cli.priors.function_prior import FunctionPrior
+from simpel_cli.priors.gaussian_process import Spectral, gram
+from simpel_cli.priors.marginal_likelihood import MOST_ROWS, Spectrum, evenly, maximise_marginal_likelihood
 
 LEAST_DRAWS = 64  # that a covariance is worth taking of
 
@@ -158,7 +158,7 @@ class Pathwise:
             rest = jnp.moveaxis(draws[:, :, self.particles :].astype(jnp.float64), 1, 0)
             return (rest - jnp.mean(rest, axis=2, keepdims=True)) / (rest.shape[2] - 1) ** 0.5
 
-        def likeliest_noise(draws: Float[Array, "dy c N"], mean: Float[Array, "c dy"]) -> Float[Array, " dy"]:
+        def noise_by_marginal_likelihood(draws: Float[Array, "dy c N"], mean: Float[Array, "c dy"]) -> Float[Array, " dy"]:
             """Noise of the largest marginal likelihood, normalised."""
             few, _ = evenly(len(rows), count, MOST_ROWS)
             real, left = counts[few], (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
@@ -176,7 +176,7 @@ class Pathwise:
                 spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(real))
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
-                return likeliest(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
+                return maximise_marginal_likelihood(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(of_output, (draws[:, few], left.T, kappa, floor, typical))
@@ -194,7 +194,7 @@ class Pathwise:
             before = prior_paths(key_gap, known, draws)
             own = centred(draws)
             mean = jnp.mean(draws[:, :, self.particles :].astype(jnp.float64), axis=2)
-            sigma = likeliest_noise(own, mean)
+            sigma = noise_by_marginal_likelihood(own, mean)
             variance = sigma**2 + prior.white_variance
             measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
             noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None, None]
@@ -266,7 +266,7 @@ class Pathwise:
         if prior.kernel is not None and not isinstance(prior.kernel, Spectral):
             raise ConfigError(
                 f"prior: its kernel {type(prior.kernel).__name__} has no `frequencies`, which paths are drawn from; give it "
-                "that method (see simpel_cli/gp.py), or use SquaredExponential, Matern32 or Matern52."
+                "that method (see simpel_cli/priors/gaussian_process.py), or use SquaredExponential, Matern32 or Matern52."
             )
         return prior
 

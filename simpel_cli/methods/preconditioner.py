@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.eigen import eigh
+from simpel_cli.priors.eigenvalues import eigh
 
 
 class Basis(NamedTuple):

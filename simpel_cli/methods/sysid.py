@@ -21,7 +21,7 @@ from simpel_cli.dynamics.transition import OneStep
 from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
 from simpel_cli.predictive import Predictive
-from simpel_cli.prior import WIDE, FunctionPrior
+from simpel_cli.priors.function_prior import WIDE, FunctionPrior
 
 FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
 HOPELESS = 1e6  # damping at which a refused step was as good as none

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.eigen import eigh
 from simpel_cli.errors import ConfigError
+from simpel_cli.priors.eigenvalues import eigh
 
 KERNELS = ("squared_exponential", "imq")
 LOOKED_AT = 128  # draws of which the median distance is taken

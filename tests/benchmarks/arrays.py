@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir, recordings_dir
 from simpel_cli.inference import Method, Normaliser
-from simpel_cli.prior import GapGP, GPPrior, SimulatorPrior
+from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.problem import Assembled, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import stream
 

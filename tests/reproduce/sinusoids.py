@@ -18,7 +18,7 @@ from simpel_cli.methods.greybox import GreyBox
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
 from simpel_cli.plots.canvas import BLACK, COLOURS, new_figure, save
-from simpel_cli.prior import GPPrior, SimulatorPrior
+from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod

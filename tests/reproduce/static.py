@@ -15,7 +15,7 @@ from simpel_cli.commands.study import STRETCH
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir
 from simpel_cli.inference import Method, NoiseModel, Normaliser, ScoreEstimator
-from simpel_cli.prior import GPPrior, SimulatorPrior
+from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.problem import System, assemble, system_of
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.settings import Settings, configure, stream

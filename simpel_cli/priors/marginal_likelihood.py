@@ -2,7 +2,7 @@
 
     y - mean ~ N(0, kappa^2 R + (w + sigma^2) I),    R = V diag(values) V'
 
-In JAX, since the mean is identified there (`gap.py` does the same for a simulator whose parameters are integrated out).
+In JAX, since the mean is identified there (`gap_scale.py` does the same for a simulator whose parameters are integrated out).
 
 Reference: Rasmussen and Williams (2006), eq. 5.8.
 """
@@ -70,7 +70,7 @@ def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], r
     return Spectrum(jnp.maximum(values, 0.0), vectors, turned, counts.shape[0] - jnp.sum(counts))
 
 
-def likeliest(
+def maximise_marginal_likelihood(
     given: Spectrum,
     kappa: Float[Numbers, " dy"] | None,
     white: float,
@@ -138,12 +138,12 @@ def noise_of_smooth(
         residual: of their targets.
         rows: number of data; see `spectrum`.
         white: w.
-        prior_std: of log sigma; see `likeliest`.
+        prior_std: of log sigma; see `maximise_marginal_likelihood`.
         floor: smallest noise.
         typical: its typical value.
     """
     found = [
-        likeliest(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
+        maximise_marginal_likelihood(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
         for f in LONGER
     ]
     noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))

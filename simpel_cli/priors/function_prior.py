@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.dynamics.transition import OneStep, Transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.gp import Kernel, SquaredExponential, gram
+from simpel_cli.priors.gaussian_process import Kernel, SquaredExponential, gram
 from simulators.model import Quantity
 
 WIDE = 64  # numbers in a transition

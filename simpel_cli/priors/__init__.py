@@ -1,0 +1,1 @@
+"""Priors over functions: simulator draws plus gap GP, Gaussian processes, and scales by marginal likelihood."""
