@@ -18,7 +18,7 @@ from simpel_cli.config.nodes import build
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.nets import MLP
+from simpel_cli.inference.networks import MLP
 from simpel_cli.rl.files import contract, load_policy, save_policy
 from simpel_cli.rl.fine_tune import fading, fine_tuned, finite
 from simpel_cli.rl.planner import ICEM
@@ -430,8 +430,8 @@ def test_the_run_holds_what_is_promised(flown: Path) -> None:
 
 def test_an_interrupted_run_goes_on_to_the_same_end(flown: Path, tmp_path: Path) -> None:
     """Stopped after its second look: the files of the first half, and what follows, are those of the whole."""
-    from simpel_cli import loop
     from simpel_cli.errors import Interrupted
+    from simpel_cli.inference import loop
 
     kept = loop.train
     calls = []

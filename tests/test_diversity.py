@@ -5,7 +5,7 @@ import pytest
 
 from simpel_cli.evaluation.diversity import distinct_particles, effective_number
 from simpel_cli.evaluation.posterior import CHUNK, Posterior
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.predictive import Predictive
 
 
 def test_all_alike_are_one_and_all_apart_are_all() -> None:

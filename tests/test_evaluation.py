@@ -25,7 +25,7 @@ from simpel_cli.evaluation import (
     one_step_table,
     windows,
 )
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.predictive import Predictive
 from simulators.model import Quantity
 
 N, DY = 3000, 2

@@ -13,10 +13,11 @@ import numpy as np
 import oracles
 import pytest
 
-from simpel_cli import loop
-from simpel_cli.inference import NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.inference import loop
+from simpel_cli.inference.networks import MLP
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.methods.fsvgd import FSVGD
-from simpel_cli.nets import MLP
 from simpel_cli.priors.function_prior import GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli import loop
 from simpel_cli.errors import ConfigError, Interrupted, NumericsError
+from simpel_cli.inference import loop
 from simpel_cli.runs.interruption import interruption
 
 RATE, DIM = 0.1, 3

@@ -10,9 +10,12 @@ import optax
 import oracles
 import pytest
 
-from simpel_cli import loop
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import Inference, NoiseModel, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.inference import loop
+from simpel_cli.inference.networks import MLP
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.protocols import Inference, Normaliser, Problem, Setting, pad_rows, padded_length
 from simpel_cli.methods.exact_gp import ExactGP
 from simpel_cli.methods.fmap import FunctionMAP
 from simpel_cli.methods.fsvgd import FSVGD, stein_velocity
@@ -22,8 +25,6 @@ from simpel_cli.methods.preconditioner import basis, preconditioned
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
-from simpel_cli.nets import MLP
-from simpel_cli.predictive import Predictive
 from simpel_cli.priors.function_prior import FunctionPrior, GPPrior
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Quantity

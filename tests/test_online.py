@@ -28,7 +28,7 @@ from simpel_cli.data import Measurements, read
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError, DataError
-from simpel_cli.nets import MLP
+from simpel_cli.inference.networks import MLP
 from simpel_cli.rl.answers import Answers
 from simpel_cli.rl.exchange import Exchange
 from simpel_cli.rl.files import contract, load_policy, save_policy

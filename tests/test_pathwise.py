@@ -12,9 +12,10 @@ from test_methods import EDGE, FIXED, GRID, NOISE, PARAMS, X, predicted, prior_o
 
 from simpel_cli.commands.show import used
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import Bank, Inference, NoiseModel, Normaliser, Problem, pad_rows, padded_length
+from simpel_cli.inference.networks import MLP
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Bank, Inference, Normaliser, Problem, pad_rows, padded_length
 from simpel_cli.methods.pathwise import Pathwise
-from simpel_cli.nets import MLP
 from simpel_cli.priors.function_prior import FunctionPrior
 from simpel_cli.priors.gaussian_process import SquaredExponential
 from simpel_cli.priors.marginal_likelihood import evenly

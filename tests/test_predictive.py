@@ -6,7 +6,7 @@ import oracles
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.predictive import Predictive
 
 RNG = np.random.default_rng(0)
 PARTICLES = RNG.normal(size=(6, 4, 2)) * [1.0, 5.0] + [0.0, 3.0]

@@ -6,10 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from simpel_cli.inference import Bank, NoiseModel, Normaliser, Setting
-from simpel_cli.prior_predictive import SURPRISING, PriorCheck, check_prior, measurement_noise
+from simpel_cli.inference.assemble import assemble
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.prior_predictive import SURPRISING, PriorCheck, check_prior, measurement_noise
+from simpel_cli.inference.protocols import Bank, Normaliser, Setting
+from simpel_cli.inference.system import System, normaliser_of, system_of
 from simpel_cli.priors.function_prior import GapGP, SimulatorPrior
-from simpel_cli.problem import System, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import stream
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Declared

@@ -9,19 +9,13 @@ import pytest
 from scipy import stats
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import NoiseModel, padded_length
+from simpel_cli.inference.assemble import SCALE_DRAWS, SCALE_POINTS, WORLD_SCALE_POINTS, assemble
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import padded_length
+from simpel_cli.inference.system import WORLD_POINTS, normaliser_of, system_of  # fmt: skip
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales
-from simpel_cli.priors.marginal_likelihood import maximise_marginal_likelihood, noise_of_smooth, spectrum
-from simpel_cli.problem import (
-    SCALE_DRAWS,
-    SCALE_POINTS,
-    WORLD_POINTS,
-    WORLD_SCALE_POINTS,
-    assemble,
-    normaliser_of,
-    system_of,
-)  # fmt: skip
+from simpel_cli.priors.marginal_likelihood import best_scales, noise_of_smooth, spectrum
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.model import Declared, ModelError
 from simulators.worlds.callable_world import CallableWorld
@@ -278,7 +272,7 @@ def test_a_short_lengthscale_in_many_dimensions_does_not_hide_the_noise():
     np.testing.assert_allclose(found, [0.2, 0.02], rtol=0.25)
     assert asked[0] == 1.0
     assert len(set(asked)) == len(asked)
-    own = maximise_marginal_likelihood(spectrum(correlation(1.0), jnp.asarray(y), given[0]), None, *given[1:]).noise
+    own = best_scales(spectrum(correlation(1.0), jnp.asarray(y), given[0]), None, *given[1:]).noise
     assert (np.abs(np.log(np.asarray(own) / [0.2, 0.02])) > np.log(1.4)).any()
 
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli import loop
 from simpel_cli.commands.judge import judge
 from simpel_cli.commands.study import STRETCH, open_study, posteriors, prepare
 from simpel_cli.config.nodes import build
 from simpel_cli.data import transitions
+from simpel_cli.inference import loop
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.metrics import write_metrics
 

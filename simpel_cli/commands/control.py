@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli import loop
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
 from simpel_cli.config.nodes import build
@@ -18,7 +17,8 @@ from simpel_cli.data.recording import Source
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import Problem
+from simpel_cli.inference import loop
+from simpel_cli.inference.protocols import Problem
 from simpel_cli.rl.comparable import check_comparable
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from simpel_cli import loop
 from simpel_cli.commands.judge import Judged, judge
 from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
@@ -16,6 +15,7 @@ from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, poster
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.inference import loop
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied, typed

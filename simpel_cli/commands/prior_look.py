@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from simpel_cli.commands.study import Fitted, Study
-from simpel_cli.prior_predictive import OutputCheck, PriorCheck, check_prior
+from simpel_cli.inference.prior_predictive import OutputCheck, PriorCheck, check_prior
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.settings import stream
 

@@ -12,9 +12,9 @@ from simpel_cli.commands.run_table import named_method
 from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
-from simpel_cli.inference import Method
+from simpel_cli.inference.prior_predictive import PriorCheck
+from simpel_cli.inference.protocols import Method
 from simpel_cli.plots import draw_run
-from simpel_cli.prior_predictive import PriorCheck
 from simpel_cli.report import figure, write_report
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed

@@ -15,9 +15,10 @@ from simpel_cli.config.nodes import build
 from simpel_cli.data import Measurements, Recording, absolute, no_transitions, read, select, transitions
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.evaluation import Posterior, test_arrays
-from simpel_cli.inference import Inference, Method, Normaliser, Problem, Setting
+from simpel_cli.inference.assemble import Assembled, assemble
+from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting
+from simpel_cli.inference.system import System, normaliser_of, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
-from simpel_cli.problem import Assembled, System, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import Settings, configure, stream
 
 STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often

@@ -8,7 +8,7 @@ from simpel_cli.data.recording import Episode
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import Posterior, noise_of
-from simpel_cli.inference import padded_length
+from simpel_cli.inference.protocols import padded_length
 
 
 class FreeRun(NamedTuple):

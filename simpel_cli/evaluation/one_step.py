@@ -14,7 +14,7 @@ from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import CHUNK, Posterior
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.predictive import Predictive
 
 LEVELS = np.arange(0.05, 0.951, 0.05)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Transitions
 from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.predictive import Predictive
 
 CHUNK = 512  # test inputs per call: one compiled program serves every test set
 

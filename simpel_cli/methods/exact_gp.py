@@ -17,11 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.inference.noise import NoiseModel, Numbers
+from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
-from simpel_cli.predictive import Predictive
 from simpel_cli.priors.gaussian_process import gram
-from simpel_cli.priors.marginal_likelihood import Spectrum, maximise_marginal_likelihood, spectrum
+from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, spectrum
 
 
 class State(NamedTuple):
@@ -63,7 +64,7 @@ class ExactGP:
         return self.sysid.noise
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`).
 
         Raises:
             ConfigError: the prior has no gap process.
@@ -87,7 +88,7 @@ class ExactGP:
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = spectrum(gram(kernel, known, known), left, problem.m)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = maximise_marginal_likelihood(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
+            best = best_scales(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
                 data,

@@ -23,10 +23,11 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
-from simpel_cli.methods.networks import Networks, State, refuse_rates
+from simpel_cli.inference.networks import MLP
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
+from simpel_cli.methods.particle_networks import Networks, State, refuse_rates
 from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
-from simpel_cli.nets import MLP
 from simpel_cli.scores.estimator import Score, fitted
 from simpel_cli.scores.gaussian import moments
 
@@ -109,7 +110,7 @@ class FunctionSpace(ABC):
         """Return where function values of L particles go, and how near the particles are: the mean kernel between two."""
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`)."""
         to_normalised = problem.normaliser
         dtype = problem.x.dtype
         n_rows = problem.x.shape[0]

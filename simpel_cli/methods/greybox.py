@@ -15,12 +15,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
+from simpel_cli.inference.noise import NoiseModel, Numbers
+from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
-from simpel_cli.predictive import Predictive
 from simpel_cli.priors.function_prior import GPPrior
-from simpel_cli.priors.marginal_likelihood import MOST_ROWS, evenly, maximise_marginal_likelihood, noise_of_smooth, spectrum
+from simpel_cli.priors.marginal_likelihood import (
+    MOST_ROWS,
+    best_scales,
+    evenly,
+    noise_of_smooth,
+    spectrum,
+)
 from simpel_cli.scores.gaussian import Gaussian
 
 
@@ -79,7 +86,7 @@ class GreyBox:
         return replace(self.residual.noise, marginal_share=0.0)
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`)."""
         _, run = simulator_of(setting)
         scale, dtype = problem.normaliser, problem.x.dtype
         # of a residual that is scaled to 1
@@ -116,7 +123,7 @@ class GreyBox:
                 return stretched.covariance(x, ones[:1])[0]
 
             prior_std = noise.prior_std if noise.learn else None
-            best = maximise_marginal_likelihood(spectrum(correlation(1.0), y, m), kappa, 0.0, prior_std, floor, init)
+            best = best_scales(spectrum(correlation(1.0), y, m), kappa, 0.0, prior_std, floor, init)
             if not floors:
                 return best.scale.astype(dtype), jnp.asarray(floor)
             sigma = jnp.maximum(best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init))

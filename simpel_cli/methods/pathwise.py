@@ -23,13 +23,14 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.inference import Inference, Info, NoiseModel, Numbers, Problem, Setting
-from simpel_cli.methods import networks as nets
-from simpel_cli.methods.networks import Networks, refuse_rates
-from simpel_cli.nets import MLP
+from simpel_cli.inference.networks import MLP
+from simpel_cli.inference.noise import NoiseModel, Numbers
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
+from simpel_cli.methods import particle_networks as nets
+from simpel_cli.methods.particle_networks import Networks, refuse_rates
 from simpel_cli.priors.function_prior import FunctionPrior
 from simpel_cli.priors.gaussian_process import Spectral, gram
-from simpel_cli.priors.marginal_likelihood import MOST_ROWS, Spectrum, evenly, maximise_marginal_likelihood
+from simpel_cli.priors.marginal_likelihood import MOST_ROWS, Spectrum, best_scales, evenly
 
 LEAST_DRAWS = 64  # that a covariance is worth taking of
 
@@ -106,7 +107,7 @@ class Pathwise:
         refuse_rates(self.learning_rate, self.final_learning_rate)
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`).
 
         Raises:
             ConfigError: the prior has too few draws, or a kernel whose paths cannot be drawn.
@@ -158,7 +159,9 @@ class Pathwise:
             rest = jnp.moveaxis(draws[:, :, self.particles :].astype(jnp.float64), 1, 0)
             return (rest - jnp.mean(rest, axis=2, keepdims=True)) / (rest.shape[2] - 1) ** 0.5
 
-        def noise_by_marginal_likelihood(draws: Float[Array, "dy c N"], mean: Float[Array, "c dy"]) -> Float[Array, " dy"]:
+        def noise_by_marginal_likelihood(
+            draws: Float[Array, "dy c N"], mean: Float[Array, "c dy"]
+        ) -> Float[Array, " dy"]:
             """Noise of the largest marginal likelihood, normalised."""
             few, _ = evenly(len(rows), count, MOST_ROWS)
             real, left = counts[few], (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
@@ -176,7 +179,7 @@ class Pathwise:
                 spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(real))
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
-                return maximise_marginal_likelihood(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
+                return best_scales(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(of_output, (draws[:, few], left.T, kappa, floor, typical))

@@ -11,11 +11,12 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
+from simpel_cli.inference.networks import MLP, Particles
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.fsvgd import refuse_bandwidth, stein_velocity
 from simpel_cli.methods.function_space import at_least_one, distinct_rows, log_likelihood
-from simpel_cli.methods.networks import Networks, State, refuse_rates
-from simpel_cli.nets import MLP, Particles
+from simpel_cli.methods.particle_networks import Networks, State, refuse_rates
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class SVGD:
                 raise ConfigError(f"method.{name}: got {getattr(self, name)}; it must be positive.")
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`)."""
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`)."""
         to_normalised = problem.normaliser
         dtype = problem.x.dtype
         n_rows = problem.x.shape[0]

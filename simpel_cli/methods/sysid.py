@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.dynamics.transition import OneStep
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.inference import Inference, Info, NoiseModel, Problem, Setting
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.priors.function_prior import WIDE, FunctionPrior
 
 FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
@@ -63,7 +64,7 @@ class SysID:
         check_at_least_one("method", self, ("steps", "starts", "particles"))
 
     def bind(self, setting: Setting, problem: Problem) -> Inference:
-        """Return the rule for this problem (see `simpel_cli.inference.Inference`).
+        """Return the rule for this problem (see `simpel_cli.inference.protocols.Inference`).
 
         Raises:
             ConfigError: there is no simulator in symbols to identify.

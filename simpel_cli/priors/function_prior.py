@@ -56,7 +56,7 @@ class GapGP:
 
 
 class FunctionPrior(NamedTuple):
-    """A prior bound to a system; see `simpel_cli.inference.PriorProcess`.
+    """A prior bound to a system; see `simpel_cli.inference.protocols.PriorProcess`.
 
     Args:
         draws: number of simulator draws, N.

@@ -70,7 +70,7 @@ def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], r
     return Spectrum(jnp.maximum(values, 0.0), vectors, turned, counts.shape[0] - jnp.sum(counts))
 
 
-def maximise_marginal_likelihood(
+def best_scales(
     given: Spectrum,
     kappa: Float[Numbers, " dy"] | None,
     white: float,
@@ -138,12 +138,12 @@ def noise_of_smooth(
         residual: of their targets.
         rows: number of data; see `spectrum`.
         white: w.
-        prior_std: of log sigma; see `maximise_marginal_likelihood`.
+        prior_std: of log sigma; see `best_scales`.
         floor: smallest noise.
         typical: its typical value.
     """
     found = [
-        maximise_marginal_likelihood(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
+        best_scales(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
         for f in LONGER
     ]
     noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))

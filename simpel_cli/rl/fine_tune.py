@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.nets import Layers
+from simpel_cli.inference.networks import Layers
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.rollout import episodes, reflex
 from simpel_cli.rl.world import Situation, Step, World

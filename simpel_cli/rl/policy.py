@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.nets import MLP, Layers
+from simpel_cli.inference.networks import MLP, Layers
 
 LOG_STD = (-5.0, 2.0)  # of the Gaussian before the tanh
 

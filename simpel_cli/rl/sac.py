@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.nets import MLP
+from simpel_cli.inference.networks import MLP
 from simpel_cli.rl import replay as memory
 from simpel_cli.rl.policy import Actor, Policy
 from simpel_cli.rl.replay import Replay, Transitions
@@ -83,7 +83,7 @@ class Info(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """The training on one world, as `simpel_cli.loop` runs it, and the policy of a state."""
+    """The training on one world, as `simpel_cli.inference.loop` runs it, and the policy of a state."""
 
     init: Callable[[PRNGKeyArray], State]
     draw: Callable[[PRNGKeyArray, State], None]

@@ -16,9 +16,10 @@ from omegaconf import OmegaConf
 
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir, recordings_dir
-from simpel_cli.inference import Method, Normaliser
+from simpel_cli.inference.assemble import Assembled, assemble
+from simpel_cli.inference.protocols import Method, Normaliser
+from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
-from simpel_cli.problem import Assembled, assemble, normaliser_of, system_of
 from simpel_cli.runs.settings import stream
 
 STEPS = {20: 5000, 50: 5000, 320: 7000, 400: 8000}  # of the reference, per training size

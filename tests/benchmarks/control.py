@@ -22,9 +22,9 @@ import numpy as np
 import optax
 import yaml
 
-from simpel_cli import loop
 from simpel_cli.config.nodes import build
 from simpel_cli.dynamics.transition import encoding_of, transition
+from simpel_cli.inference import loop
 from simpel_cli.rl.control import Control
 from simpel_cli.rl.fine_tune import fine_tuned
 from simpel_cli.rl.policy import Policy

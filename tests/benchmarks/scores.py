@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.inference import ScoreEstimator
+from simpel_cli.inference.protocols import ScoreEstimator
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.settings import Settings, configure
 from simpel_cli.scores.gaussian import Gaussian

@@ -27,8 +27,8 @@ def measured(name: str) -> dict[str, float]:
     import yaml
 
     from simpel_cli.config.nodes import build
+    from simpel_cli.inference.system import system_of
     from simpel_cli.priors.function_prior import SimulatorPrior
-    from simpel_cli.problem import system_of
     from simpel_cli.runs.settings import Settings, configure
 
     configure(Settings(cache=False))

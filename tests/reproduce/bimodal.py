@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.inference import ScoreEstimator
+from simpel_cli.inference.protocols import ScoreEstimator
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.plots.canvas import COLOURS, new_figure, save
 from simpel_cli.priors.function_prior import SimulatorPrior

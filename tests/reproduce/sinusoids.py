@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.inference import Method, ScoreEstimator
+from simpel_cli.inference.protocols import Method, ScoreEstimator
 from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.methods.greybox import GreyBox
 from simpel_cli.methods.svgd import SVGD

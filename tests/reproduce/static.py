@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from simpel_cli import loop
 from simpel_cli.commands.study import STRETCH
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir
-from simpel_cli.inference import Method, NoiseModel, Normaliser, ScoreEstimator
+from simpel_cli.inference import loop
+from simpel_cli.inference.assemble import assemble
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Method, Normaliser, ScoreEstimator
+from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
-from simpel_cli.problem import System, assemble, system_of
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.settings import Settings, configure, stream
 

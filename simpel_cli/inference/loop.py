@@ -20,7 +20,7 @@ from simpel_cli.runs.interruption import interruption
 
 @runtime_checkable
 class Rule(Protocol):
-    """The part of an inference rule that the driver needs; see `simpel_cli.inference.Inference`."""
+    """The part of an inference rule that the driver needs; see `simpel_cli.inference.protocols.Inference`."""
 
     @property
     def init(self) -> Callable[[PRNGKeyArray], Any]:

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from scipy.special import ndtri
 
-from simpel_cli.inference import Bank, Normaliser, Setting
-from simpel_cli.problem import System
+from simpel_cli.inference.protocols import Bank, Normaliser, Setting
+from simpel_cli.inference.system import System
 
 DRAWS = 2048  # half of them for the moments, half to compare with
 MOST_ROWS = 128

@@ -8,9 +8,10 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference import NoiseModel, Problem
-from simpel_cli.nets import MLP, Particles
-from simpel_cli.predictive import Predictive
+from simpel_cli.inference.networks import MLP, Particles
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.protocols import Problem
 
 
 def refuse_rates(learning_rate: float, final: float) -> None:

@@ -1,0 +1,1 @@
+"""What every inference rule takes and gives: protocols, problem arrays, networks, predictive mixture, training loop."""
