@@ -9,11 +9,11 @@ import yaml
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery import corrected as module
-from simpel_cli.discovery.augmented import augment
-from simpel_cli.discovery.fit import Optimum
-from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.setup import terms_of
+from simpel_cli.discovery.likelihood.augmented import augment
+from simpel_cli.discovery.likelihood.fit import Optimum
+from simpel_cli.discovery.search.setup import terms_of
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.verdict import corrected as module
 from simulators.effects import Scales, Term
 
 CASES = {

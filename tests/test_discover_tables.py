@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.assess import SETTLE, Assessment
-from simpel_cli.discovery.residual import Force
-from simpel_cli.discovery.tables import (
+from simpel_cli.discovery.likelihood.latent_force import Force
+from simpel_cli.discovery.measurements.windows import windows_of
+from simpel_cli.discovery.search.errors_ahead import SETTLE, Assessment
+from simpel_cli.discovery.verdict.tables import (
     column_names,
     error_columns,
     innovation_columns,
@@ -16,7 +17,6 @@ from simpel_cli.discovery.tables import (
     residual_columns,
     trajectory_columns,
 )
-from simpel_cli.discovery.windows import windows_of
 
 LEAD = 2
 

@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.filter import Moving, Noise
-from simpel_cli.discovery.fit import Fitter, Lane
-from simpel_cli.discovery.search import Search
-from simpel_cli.discovery.selection import select
-from simpel_cli.discovery.setup import Setup, setup
+from simpel_cli.discovery.likelihood.filter import Moving, Noise
+from simpel_cli.discovery.likelihood.fit import Fitter, Lane
+from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.setup import Setup, setup
+from simpel_cli.discovery.search.trials import Search
 from simulators.effects import Expression
 from simulators.model import Declared
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.assess import Assessment, Assessor
-from simpel_cli.discovery.fit import Lane, Optimum
-from simpel_cli.discovery.gate import RUNAWAY, gates, harmful
-from simpel_cli.discovery.search import Trial
-from simpel_cli.discovery.windows import Windows
+from simpel_cli.discovery.likelihood.fit import Lane, Optimum
+from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
+from simpel_cli.discovery.search.gate import RUNAWAY, gates, harmful
+from simpel_cli.discovery.search.trials import Trial
 from tests.test_twins import searched
 
 

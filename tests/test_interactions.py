@@ -11,19 +11,19 @@ from test_discovery_filter import DT, LOAD, model, recording
 
 from simpel_cli.commands.discover import _gated, _of_two
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.assess import Assessor
-from simpel_cli.discovery.coordinates import CUT
-from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.interactions import BASES, carried, names_of
-from simpel_cli.discovery.levels import Levels
-from simpel_cli.discovery.remainder import remainder_of
-from simpel_cli.discovery.search import Search
-from simpel_cli.discovery.selection import Selection, cut, select
-from simpel_cli.discovery.sensitivity import shifts, waves
-from simpel_cli.discovery.settings import Discovery
-from simpel_cli.discovery.setup import Setup, key_of, setup
-from simpel_cli.discovery.setup import test_windows as windows_of_tests
-from simpel_cli.discovery.verdict import verdict_of
+from simpel_cli.discovery.likelihood.coordinates import CUT
+from simpel_cli.discovery.likelihood.fit import Fitter
+from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
+from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.interactions import BASES, carried, names_of
+from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.selection import Selection, cut, select
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.setup import Setup, key_of, setup
+from simpel_cli.discovery.search.setup import test_windows as windows_of_tests
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.verdict.remainder import remainder_of
+from simpel_cli.discovery.verdict.verdict import verdict_of
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, functions_of_two
 from simulators.model import Declared

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.coordinates import Coordinates
-from simpel_cli.discovery.filter import Filter, Track
-from simpel_cli.discovery.residual import Forces, smooth
-from simpel_cli.discovery.windows import Windows
+from simpel_cli.discovery.likelihood.coordinates import Coordinates
+from simpel_cli.discovery.likelihood.filter import Filter, Track
+from simpel_cli.discovery.likelihood.latent_force import Forces, smooth
+from simpel_cli.discovery.measurements.windows import Windows
 
 DT = 0.1
 

@@ -12,14 +12,13 @@ import pytest
 from simpel_cli.commands import discover
 from simpel_cli.commands.discover import _calibrated, _gated
 from simpel_cli.data.recording import Recording
-from simpel_cli.discovery import search as search_module
-from simpel_cli.discovery.assess import Assessor
-from simpel_cli.discovery.cleaned import Cleaned
-from simpel_cli.discovery.fit import Fitter, Lane, Optimum
-from simpel_cli.discovery.gate import Gate
-from simpel_cli.discovery.screen import Score, promises
-from simpel_cli.discovery.search import ACCEPT, QUIETER, SAME, TIE, Trial, asked
-from simpel_cli.discovery.selection import cut, further, select
+from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.measurements.cleaning import Cleaned
+from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.gate import Gate
+from simpel_cli.discovery.search.score_test import Score
+from simpel_cli.discovery.search.selection import cut, further, select
+from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
 from tests.test_swings import pushed
@@ -148,11 +147,11 @@ def test_a_function_that_promises_much_keeps_no_name_from_being_fitted(monkeypat
     table = Table({"": 0.0})
     table.search.banned = set(sorted(table.search.banned)[2:])
 
-    def promised(_: Any, __: Any, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+    def promised(_: Any, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
         size = {"?": 250.0, "A": 20.0, "E": 1.6}
         return [Score(size.get(table.name(t), 19.0), 1.0) for t, _ in starts]
 
-    monkeypatch.setattr(search_module, "promises", promised)
+    monkeypatch.setattr(table.search, "promises", promised)
     base = table.search.base()
     trials = table.search.add(base, table.search.candidates(())).trials
     assert {table.name(t.terms[-1]) for t in trials} == {
@@ -225,7 +224,7 @@ def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> 
     search: Any = searched("b", [late])
     search.fitter = MadeUp(search.rows[0][0], 0.0)
     before = Trial((), search.base().optimum)
-    short, long = promises(search, before, search.starts(before, [0]))
+    short, long = search.promises(before, search.starts(before, [0]))
     assert np.isfinite(short.gain)
     assert long.gain == np.inf
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from simpel_cli.discovery import shortlist as module
-from simpel_cli.discovery.residual import Force
-from simpel_cli.discovery.setup import key_of
-from simpel_cli.discovery.shortlist import shortlist
+from simpel_cli.discovery.likelihood.latent_force import Force
+from simpel_cli.discovery.search import shortlist as module
+from simpel_cli.discovery.search.setup import key_of
+from simpel_cli.discovery.search.shortlist import shortlist
 from tests.test_twins import searched
 
 

@@ -11,14 +11,14 @@ from test_discovery_filter import DT
 from test_interactions import FRICTION, NOISE, ROWS
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.assess import Assessor
-from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.levels import Level, Levels, evidence
-from simpel_cli.discovery.remainder import dependence, remainder_of
-from simpel_cli.discovery.search import Search
-from simpel_cli.discovery.selection import Selection, select
-from simpel_cli.discovery.setup import setup
-from simpel_cli.discovery.swings import Swing, _evidence, _told, swing
+from simpel_cli.discovery.likelihood.fit import Fitter
+from simpel_cli.discovery.search.disturbances import Swing, _evidence, _told, swing
+from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.noise_profile import Level, Levels, evidence
+from simpel_cli.discovery.search.selection import Selection, select
+from simpel_cli.discovery.search.setup import setup
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.verdict.remainder import dependence, remainder_of
 from simulators.model import Declared, Model
 
 PERIOD = 0.9  # s

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.verdict import _distinct
-from simpel_cli.discovery.windows import Windows, thinned, windows_of
+from simpel_cli.discovery.measurements.windows import Windows, thinned, windows_of
+from simpel_cli.discovery.verdict.verdict import _distinct
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from simpel_cli.discovery.unseen import SURPRISING, caveats
+from simpel_cli.discovery.verdict.undetectable import SURPRISING, caveats
 
 FOUND: dict[str, Any] = {
     "verdict": "none", "not_tested": [], "data_checks": [{"check": "kinematics", "ok": True}],

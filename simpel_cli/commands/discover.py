@@ -16,28 +16,28 @@ from simpel_cli.commands.study import open_study, refuse_untested, resolved, set
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump
-from simpel_cli.discovery.assess import Assessor
-from simpel_cli.discovery.cleaned import Cleaned, cleaned, outlier_check
-from simpel_cli.discovery.corrected import corrected
-from simpel_cli.discovery.exhibits import exhibits
-from simpel_cli.discovery.fit import Fitter
-from simpel_cli.discovery.gate import Gate, gates
-from simpel_cli.discovery.interactions import interaction
-from simpel_cli.discovery.levels import Levels
-from simpel_cli.discovery.next_experiment import next_experiment
-from simpel_cli.discovery.outliers import gated, without_new
-from simpel_cli.discovery.remainder import remainder_of
-from simpel_cli.discovery.residual import Forces
-from simpel_cli.discovery.search import Search, Trial
-from simpel_cli.discovery.selection import Selection, cut, further, refused, select
-from simpel_cli.discovery.settings import Discovery
-from simpel_cli.discovery.setup import Key, Setup, key_of, setup, terms_of, test_windows
-from simpel_cli.discovery.shortlist import MOST_KNOBS, shortlist
-from simpel_cli.discovery.starts import begun, moved
-from simpel_cli.discovery.swings import swing
-from simpel_cli.discovery.unseen import caveats, unseen
-from simpel_cli.discovery.verdict import AMBIGUOUS, steps_of, verdict_of
-from simpel_cli.discovery.windows import Windows
+from simpel_cli.discovery.likelihood.fit import Fitter
+from simpel_cli.discovery.likelihood.latent_force import Forces
+from simpel_cli.discovery.measurements.cleaning import Cleaned, cleaned, outlier_check
+from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.discovery.next_experiment.design import next_experiment
+from simpel_cli.discovery.search.disturbances import swing
+from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.gate import Gate, gates
+from simpel_cli.discovery.search.initial_states import begun, moved
+from simpel_cli.discovery.search.interactions import interaction
+from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.outliers import gated, without_new
+from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.setup import Key, Setup, key_of, setup, terms_of, test_windows
+from simpel_cli.discovery.search.shortlist import MOST_KNOBS, shortlist
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.verdict.corrected import corrected
+from simpel_cli.discovery.verdict.evidence import exhibits
+from simpel_cli.discovery.verdict.remainder import remainder_of
+from simpel_cli.discovery.verdict.undetectable import caveats, unseen
+from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied

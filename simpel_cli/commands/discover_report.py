@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.remainder import dependence
-from simpel_cli.discovery.search import ACCEPT, FURTHER
+from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
+from simpel_cli.discovery.verdict.remainder import dependence
 from simpel_cli.plots import draw_discover
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import figure

@@ -7,7 +7,7 @@ import numpy as np
 
 from simpel_cli.commands.discover_report import HORIZONS, reliable, rows_of, sections_of, untested, words
 from simpel_cli.config.resolved import dump, load
-from simpel_cli.discovery.unseen import in_words
+from simpel_cli.discovery.verdict.undetectable import in_words
 from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
 from simpel_cli.report import write_report
 from simpel_cli.runs.console import Terminal

@@ -1,0 +1,1 @@
+"""Finding what a simulator lacks: measurements, likelihood, search, verdict, next experiment; each uses those before it."""

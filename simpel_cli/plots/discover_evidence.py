@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.search import ACCEPT, TIE
+from simpel_cli.discovery.search.trials import ACCEPT, TIE
 from simpel_cli.plots.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
 
 LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge

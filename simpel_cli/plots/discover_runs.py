@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.whiteness import autocorrelation, cumulated_periodogram
+from simpel_cli.discovery.likelihood.whiteness import autocorrelation, cumulated_periodogram
 from simpel_cli.plots.canvas import (
     BLACK,
     COLOURS,

@@ -1,0 +1,325 @@
+"""Continuous-discrete extended Kalman filter: innovations of a model on a window of measurements.
+
+    dx = f(x, u; p) dt + q dW,    y_k = h(x_k, u_k; p) + r_k,    r_k ~ N(0, R),  R diagonal
+
+The state is never taken as known, so noise in it does not bias the fit, and a state that no sensor measures needs nothing
+special. The process noise q makes the horizon adapt: a wrong model follows the data, the right one is judged on whole
+episodes. R is diagonal, so a row of measurements is taken in one scalar after the other (Bierman 1977): no inverse, and
+a missing one is left out.
+
+Derivatives do without second derivatives inside the integrator. Where a noise moves they are exact. Where a parameter of a
+small model moves, the Jacobian of a row follows to second order in dt. A large model holds its gains then, as the innovations
+form of a prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
+
+All arrays may have trailing axes for many windows and hypotheses at once: the innermost loops then run over contiguous
+numbers.
+
+Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004); Ljung
+(1999), System identification, ch. 7.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from simpel_cli.discovery.likelihood.augmented import Augmented
+from simpel_cli.discovery.likelihood.derivatives import Moving, Value, movable, still, with_slope
+from simpel_cli.discovery.likelihood.sensor_delay import back, echo, no_jumps, pushed
+from simpel_cli.discovery.likelihood.small_matrices import along, apart, product
+from simpel_cli.dynamics.input_delay import delayed_inputs
+from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
+
+
+class Noise(NamedTuple):
+    """Standard deviations of the measurements (ny, ...) and of the process, per square root of a second (nx, ...)."""
+
+    r: Float[Array, "ny ..."]
+    q: Float[Array, "nx ..."]
+
+
+class Track(NamedTuple):
+    """What the filter leaves behind, one row per measured row."""
+
+    innovation: Float[Array, "T ny ..."]
+    variance: Float[Array, "T ny ..."]
+    predicted: Float[Array, "T nx ..."]
+    predicted_cov: Float[Array, "T nx nx ..."]
+    mean: Float[Array, "T nx ..."]
+    cov: Float[Array, "T nx nx ..."]
+    jacobian: Float[Array, "T nx nx ..."]  # of the transition to the next row
+    slope: Float[Array, "T ny nx ..."]  # of what the sensors read, in the predicted state
+
+
+class Held(NamedTuple):
+    """What stays as it is where a parameter moves, one row per measured row."""
+
+    gain: Float[Array, "T ny nx ..."]  # 0 where a measurement does not count
+    prompt: Float[Array, "T ny nx ..."]  # slope of what the sensors would read, were none late
+    rate_x: Float[Array, "T nx nx ..."]  # slope of the rates in the state, at the end of the row before
+
+
+class Filter(NamedTuple):
+    """The filter of one augmented model; every array may have further axes behind those named here.
+
+    Args:
+        track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
+        moved: (moving, noise, track, held, y, ok, u, start, spread) -> innovations and variances: to be differentiated in
+            what moves.
+        louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
+        flow: (p, x, u of the substeps) -> x one row later.
+        measure: (p, x, u) -> what the sensors read.
+        delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, nu).
+    """
+
+    track: Callable[..., tuple[Track, Held]]
+    moved: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
+    louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
+    flow: Callable[..., Float[Array, " nx"]]
+    measure: Callable[..., Float[Array, " ny"]]
+    delayed_inputs: Callable[..., Float[Array, "T substeps nu"]]
+
+
+SMALL = 3  # states of a model whose covariance follows the parameters
+_KEPT: OrderedDict[tuple, Filter] = OrderedDict()
+MOST_KEPT = (
+    16  # filters; searches of one process that differ in their measurements only share what was traced and compiled
+)
+
+
+def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
+    """Filter of an augmented model, float64; the same object for models that are the same.
+
+    Args:
+        augmented: model with candidates.
+        substeps: Runge-Kutta steps per row.
+        lead: rows of past input in front of each window.
+    """
+    model = augmented.model
+    key = (
+        augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
+        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag, substeps,
+        lead,
+    )  # fmt: skip
+    if key not in _KEPT:
+        _KEPT[key] = _filter_of(augmented, substeps, lead)
+        while len(_KEPT) > MOST_KEPT:
+            _KEPT.popitem(last=False)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
+def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
+    model = augmented.model
+    rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
+    moving_rates, moving_sensors = movable(augmented, 0), movable(augmented, 1)
+    dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
+    small = nx <= SMALL  # of a large one the second derivatives are not even made
+    bend = movable(augmented, 0, slope=True) if small else None
+    h = dt / substeps
+    periodic = {q.name for q in model.states if q.periodic}
+    wraps = [name in periodic for name in augmented.measured]
+    delays, lags, plays = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH))
+    sensor_delays, sensor_lags = (augmented.operators[kind] for kind in (SENSOR_DELAY, SENSOR_LAG))
+
+    def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
+        values = [jnp.full(p.shape[1:], own[i] if own else 0.0, p.dtype) for i in range(size)]
+        for signal, row in rows:
+            values[signal] = values[signal] + p[row]
+        return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
+
+    def inputs(p: Array, u: Array) -> Array:
+        times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
+        widths = (per_signal(p, plays, nu),) if plays else ()
+
+        def one(u: Array, delay: Array, lag: Array, *play: Array) -> Array:
+            return delayed_inputs(
+                u, delay, lag, dt=dt, substeps=substeps, lead=lead, half_play=play[0] if play else None
+            )
+
+        return _over_points(one, p.ndim - 1)(u, *times, *widths)
+
+    # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
+    stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
+
+    def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return the state one row later, and the rate there."""
+
+        def step(carry: tuple[Array, Array], u: Array) -> tuple[tuple[Array, Array], None]:
+            x, before = carry
+
+            def stage(carry: tuple[Array, Array], weights: Array) -> tuple[tuple[Array, Array], None]:
+                total, slope = carry
+                slope = moving_rates(x + h * weights[0] * slope, u, given)
+                return (total + h * weights[1] * slope, slope), None
+
+            return jax.lax.scan(stage, (x, before), stages)[0], None
+
+        return jax.lax.scan(step, (x, jnp.zeros_like(x)), u)[0]
+
+    def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
+
+        def stage(carry: Any, weights: Array) -> tuple[Any, None]:
+            x, phi, u, total, total_phi, slope, slope_phi, _ = carry
+            slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
+            slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
+            after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
+            return (x, phi, u, after, after_phi, slope, slope_phi, rate_x), None
+
+        nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
+        unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
+
+        def step(carry: Any, u: Array) -> tuple[Any, None]:
+            x, phi, *_ = carry
+            end = jax.lax.scan(stage, (x, phi, u, x, phi, *nothing, nothing[1]), stages)[0]
+            return (end[3], end[4], end[5], end[7]), None
+
+        return jax.lax.scan(step, (x, unit, *nothing), u)[0]
+
+    late_ones = bool(sensor_delays or sensor_lags)
+
+    def late_by(p: Array) -> tuple[Array, Array]:
+        """Return delay d and lag tau of every sensor, (ny, ...)."""
+        return per_signal(p, sensor_delays, ny), per_signal(p, sensor_lags, ny)
+
+    def seen(p: Array, x: Array, u: Array, rate: Array, rate_x: Array, jumps: Array) -> tuple[Array, Array, Array]:
+        """Return what the sensors read, its derivative in the state, and the latter if no sensor were late."""
+        y, prompt = sensors(x, u, p)
+        if not late_ones:
+            return y, prompt, prompt
+        d, tau = late_by(p)
+        read = y + jnp.sum(prompt * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
+        return read, prompt - (d + tau)[:, None] * product(prompt, rate_x), prompt
+
+    def wrapped(error: Array) -> Array:
+        """Take a difference of angles the short way round; error: (ny, ...)."""
+        if not any(wraps):
+            return error
+        return jnp.where(along(jnp.array(wraps), error.ndim - 1), jnp.mod(error + jnp.pi, 2 * jnp.pi) - jnp.pi, error)
+
+    def halved(noise: Noise) -> Array:
+        """Half of the process noise of a row: it enters before and after the flow."""
+        return along(jnp.eye(nx), noise.q.ndim - 1) * (noise.q**2 * (dt / 2))[None]
+
+    def after(cov: Array, jacobian: Array, half: Array) -> Array:
+        return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
+
+    def of_start(spread: Array) -> Array:
+        return along(jnp.eye(nx), spread.ndim - 1) * (spread**2)[None]
+
+    def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
+        u_sub, half = inputs(p, u), halved(noise)
+
+        def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, tuple[Track, Held]]:
+            x, cov, u_before, rate, rate_x, jumps = carry
+            y_k, ok_k, u_k = data
+            predicted, predicted_cov = x, cov
+            # the sensor is read at the row: what arrived up to it is the last substep before
+            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps)
+            if late_ones:
+                jumps = pushed(jumps, prompt, rate, rates(x, u_k[0], p)[0])
+            off = wrapped(y_k - h_k)
+            errors, variances, gains = [], [], []
+            for j in range(ny):
+                c = slope[j]
+                reach = apart(product(cov, c[:, None])[:, 0])
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
+                gain = apart((ok_k[j] / s)[None] * reach)
+                errors.append(e)
+                variances.append(s)
+                gains.append(gain)
+                x = x + gain * e[None]
+                cov = cov - gain[:, None] * reach[None]
+                x, cov = apart((x, cov))
+            following, jacobian, rate_after, rate_x_after = flow_with_slope(p, x, u_k)
+            innovation, variance = jnp.stack(errors), jnp.stack(variances)
+            out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
+            held = Held(jnp.stack(gains), prompt, rate_x)
+            carry = following, after(cov, jacobian, half), u_k[-1], rate_after, rate_x_after, jumps
+            return carry, (out, held)
+
+        begin = (start, of_start(spread), u_sub[0, 0], *rates(start, u_sub[0, 0], p), no_jumps(ny, start))
+        return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
+
+    def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
+        """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
+        slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0], u[-1]), strict=True)), jnp.zeros(()))
+        change = dt / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
+        return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
+
+    def moved(
+        given: Moving, noise: Noise, at: Track, held: Held, y: Array, ok: Array, u: Array, start: Array, spread: Array
+    ) -> tuple[Array, Array]:
+        u_sub, half = inputs(given.p, u), halved(noise)
+
+        def row(carry: tuple[Array, ...], data: tuple[Any, ...]) -> tuple[tuple, tuple[Array, Array]]:
+            x, cov, u_before, rate, jumps = carry
+            y_k, ok_k, u_k, at_k, held_k = data
+            read, predicted = moving_sensors(x, u_before, given), x
+            if late_ones:
+                late = late_by(given.p)
+                read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
+                jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0], given))
+            off = wrapped(y_k - read)
+            errors, variances = [], []
+            for j in range(ny):
+                c, gain, s = at_k.slope[j], held_k.gain[j], at_k.variance[j]
+                if small:
+                    reach = product(cov, c[:, None])[:, 0]
+                    s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                    gain = (ok_k[j] / s)[None] * reach
+                    cov = cov - gain[:, None] * reach[None]
+                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
+                errors.append(e)
+                variances.append(s)
+                x = x + gain * e[None]
+            following, rate = flow(given, x, u_k)
+            if bend is not None:
+                cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), half)
+            return (following, cov, u_k[-1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
+
+        first = moving_rates(start, u_sub[0, 0], given)
+        begin = (start, of_start(spread), u_sub[0, 0], first, no_jumps(ny, start))
+        return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
+
+    def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
+        half = halved(noise)
+
+        def row(carry: tuple[Array, Array], data: tuple[Array, ...]) -> tuple[tuple, tuple[Array, Array]]:
+            away, cov = carry  # away: from the state of `at`
+            e_k, gain, slope, jacobian, ok_k = data
+            errors, variances = [], []
+            for j in range(ny):
+                c = slope[j]
+                reach = product(cov, c[:, None])[:, 0]
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                e = e_k[j] - product(c[None], away[:, None])[0, 0]
+                own = (ok_k[j] / s)[None] * reach
+                errors.append(e)
+                variances.append(s)
+                away = away + own * e[None] - gain[j] * e_k[j][None]
+                cov = cov - own[:, None] * reach[None]
+            away = product(jacobian, away[:, None])[:, 0]
+            return (away, after(cov, jacobian, half)), (jnp.stack(errors), jnp.stack(variances))
+
+        data = (at.innovation, held.gain, at.slope, at.jacobian, ok)
+        return jax.lax.scan(row, (jnp.zeros_like(spread), of_start(spread)), data)[1]
+
+    def plain_flow(p: Array, x: Array, u: Array) -> Array:
+        return flow(still(p), x, u)[0]
+
+    def plain_measure(p: Array, x: Array, u: Array) -> Array:
+        return sensors(x, u, p)[0]
+
+    return Filter(track, moved, louder, plain_flow, plain_measure, inputs)
+
+
+def _over_points(function: Callable[..., Array], extra: int) -> Callable[..., Array]:
+    for _ in range(extra):
+        function = jax.vmap(function, in_axes=-1, out_axes=-1)
+    return function

@@ -1,0 +1,328 @@
+"""Maximum a posteriori by damped Fisher scoring, and Laplace evidence, for a batch of hypotheses in one program.
+
+    f(z) = 1/2 sum_k [ log s_k + e_k^2 / s_k ] - log p(z),    I = sum_k [ e' e'^T / s + 1/2 s' s'^T / s^2 ] + prior
+    log Z = -f + d/2 log 2 pi - 1/2 log|H|
+
+In unit coordinates every eigenvalue of H is at least 12, the inverse variance of a uniform prior: a shape that the data
+do not see earns nothing. An unknown at its bound loses log 2: half of its mass lies outside.
+
+Reference: Levenberg (1944), Marquardt (1963); Kass and Raftery (1995), Bayes factors, eq. 5.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from simpel_cli.discovery.likelihood.coordinates import Coordinates
+from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Filter, Moving, Noise
+from simpel_cli.discovery.measurements.windows import Windows
+
+LEAST_CURVATURE = 12.0
+AT_BOUND = 1e-4
+ENOUGH = 0.02  # nats: a step that promises less ends a fit
+MOST_REJECTED = 6  # steps in a row
+MOST = 40  # iterations
+ROUND = 4  # iterations after which fits that have arrived make room for others
+FIRST_DAMPING = 1e-2
+
+
+class Lane(NamedTuple):
+    """One hypothesis: where to start, which unknowns move, and how much each window counts."""
+
+    z: np.ndarray  # (n,) start of all unknowns
+    free: tuple[int, ...]  # indices that move
+    weight: np.ndarray  # (W,)
+
+
+class Optimum(NamedTuple):
+    """Where a hypothesis came to rest.
+
+    Args:
+        z: (n,) all unknowns.
+        free: indices that moved.
+        loss: negative log posterior.
+        log_evidence: Laplace; -inf where the filter diverged.
+        gradient: (d,) of the loss where it came to rest.
+        fisher: (d, d) information with the prior's, unit coordinates.
+        centre: (d,) mean of the posterior as a Gaussian. A uniform prior enters with its mean and variance: in a
+            direction that the data do not see, the optimum may lie anywhere.
+        covariance: (d, d) of the free unknowns about it, unit coordinates.
+        iterations: taken.
+        converged: whether the last steps no longer helped.
+    """
+
+    z: np.ndarray
+    free: tuple[int, ...]
+    loss: float
+    log_evidence: float
+    gradient: np.ndarray
+    fisher: np.ndarray
+    centre: np.ndarray
+    covariance: np.ndarray
+    iterations: int
+    converged: bool
+
+
+class Course(NamedTuple):
+    """Where the fits of a batch of lanes stand; NumPy outside the program, JAX inside; leading axis: lanes."""
+
+    z: Any  # (L, n) where they started
+    index: Any  # (L, width) of z that move: every level of noise, in order, then parameters and knobs
+    moves: Any  # (L, width) False: padding
+    weight: Any  # (L, W)
+    trial: Any  # (L, width) the next point to try
+    part: Any  # (L, width) the best so far
+    loss: Any
+    gradient: Any
+    fisher: Any
+    damping: Any
+    iteration: Any
+    done: Any
+    rejected: Any
+
+
+class Fitter:
+    """Fits hypotheses; one compiled program for a batch of `lanes`, with up to `width` free unknowns each.
+
+    Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
+    those that wait, always in the same order: a result does not depend on the number of threads.
+    """
+
+    def __init__(
+        self, rule: Filter, coordinates: Coordinates, windows: Windows, *, lanes: int = 4, width: int = 16
+    ) -> None:
+        self.coordinates, self.windows, self.lanes, self.width = coordinates, windows, lanes, width
+        self._data = tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
+        self._program = _program(rule, coordinates.layout)
+        self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
+        self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
+
+    def __call__(self, hypotheses: Sequence[Lane], most: int = MOST) -> list[Optimum]:
+        """Fit every hypothesis with `most` iterations."""
+        if not hypotheses:
+            return []
+        state = self._begin(hypotheses)
+        waiting = np.arange(len(hypotheses))
+        while waiting.size:
+            chunks = [waiting[i : i + self.lanes] for i in range(0, len(waiting), self.lanes)]
+            # the first call compiles: not twice side by side
+            threads = self._threads.map if self._program._cache_size() else map
+            for chunk, ended in zip(chunks, threads(partial(self._advanced, state, most), chunks), strict=True):
+                for old, new in zip(state, ended, strict=True):
+                    old[chunk] = new[: len(chunk)]
+            waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
+        return [self._optimum(state, i, lane.free) for i, lane in enumerate(hypotheses)]
+
+    def on(self, windows: Windows) -> "Fitter":
+        """Return the same fitter for windows of the same shape; it shares the compiled program."""
+        other = copy(self)
+        other.windows, other._data = windows, tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
+        return other
+
+    def _begin(self, lanes: Sequence[Lane]) -> Course:
+        padding = len(self.coordinates.low) - 1
+        noise = self._noise
+        index = np.full((len(lanes), self.width), padding)
+        index[:, : len(noise)] = noise
+        moves = np.zeros(index.shape, bool)
+        for i, lane in enumerate(lanes):
+            columns = self._columns(lane.free)
+            if max(columns, default=0) >= self.width:
+                raise ValueError(f"{len(lane.free)} free unknowns, room for {self.width - len(noise)} beside the noise")
+            index[i, columns] = lane.free
+            moves[i, columns] = True
+        z = np.stack([lane.z for lane in lanes])
+        part = np.take_along_axis(z, index, axis=1)
+        count, width = index.shape
+        return Course(
+            z, index, moves, np.stack([lane.weight for lane in lanes]), part.copy(), part,
+            np.full(count, np.inf), np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1)),
+            np.full(count, FIRST_DAMPING), np.zeros(count, int), np.zeros(count, bool), np.zeros(count, int),
+        )  # fmt: skip
+
+    @property
+    def _noise(self) -> range:
+        n_p, n_r, n_q = self.coordinates.sizes
+        return range(n_p, n_p + n_r + n_q)
+
+    def _columns(self, free: Sequence[int]) -> list[int]:
+        """Columns of the program that free unknowns take: a level of noise its own, others the next one."""
+        noise = self._noise
+        others = iter(range(len(noise), len(noise) + len(free)))
+        return [i - noise.start if i in noise else next(others) for i in free]
+
+    def _advanced(self, state: Course, most: int, chunk: np.ndarray) -> list[np.ndarray]:
+        filled = np.concatenate([chunk, np.repeat(chunk[:1], self.lanes - len(chunk))])
+        lanes = Course(*(jnp.asarray(a[filled]) for a in state))
+        with jax.enable_x64(True):
+            ended = self._program(self._bounds, jnp.asarray(min(most, ROUND)), lanes, self._data)
+        return [np.asarray(a) for a in ended]
+
+    def _optimum(self, state: Course, i: int, free: tuple[int, ...]) -> Optimum:
+        z = state.z[i].copy()
+        columns = self._columns(free)
+        z[list(free)] = state.part[i, columns]
+        uniform = ~self.coordinates.normal[list(free)]
+        return _optimum(
+            z, free, uniform, float(state.loss[i]), state.gradient[i][columns], state.fisher[i][np.ix_(columns, columns)],
+            int(state.iteration[i]), bool(state.done[i]),
+        )  # fmt: skip
+
+
+def _optimum(
+    z: np.ndarray,
+    free: tuple[int, ...],
+    uniform: np.ndarray,
+    loss: float,
+    gradient: np.ndarray,
+    fisher: np.ndarray,
+    iterations: int,
+    converged: bool,
+) -> Optimum:
+    d = len(free)
+    if not np.isfinite(loss) or not np.isfinite(fisher).all():
+        return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), z[list(free)], np.eye(d), iterations, False)
+    values = np.maximum(np.linalg.eigvalsh(fisher), LEAST_CURVATURE)
+    at = z[list(free)]
+    prior = np.where(uniform, LEAST_CURVATURE, 0.0)
+    covariance = np.linalg.inv(fisher + np.diag(prior))
+    centre = at - covariance @ (prior * (at - 0.5))
+    bounded = np.sum((at < AT_BOUND) | (at > 1 - AT_BOUND))
+    evidence = -loss + d / 2 * np.log(2 * np.pi) - 0.5 * np.log(values).sum() - np.log(2) * bounded
+    return Optimum(z, free, float(loss), float(evidence), gradient, fisher, centre, covariance, iterations, converged)
+
+
+Evaluate = Callable[[Array], tuple[Array, Array, Array]]
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _program(rule: Filter, layout: tuple[Any, ...]) -> Any:
+    return jax.jit(partial(_advance, rule, layout))
+
+
+def _advance(
+    rule: Filter, layout: tuple[Any, ...], bounds: tuple[Array, ...], most: Array, lanes: Course, data: Any
+) -> Course:
+    """Levenberg-Marquardt on Fisher information, inside the unit box: `most` iterations of every lane."""
+    coordinates = Coordinates.of(bounds, layout)
+    evaluate = partial(_evaluate, rule, coordinates, lanes, data)
+
+    def body(carry: tuple[Course, Array]) -> tuple[Course, Array]:
+        now, count = carry
+        found = evaluate(now.trial)
+        return jax.vmap(_stepped)(now, *found), count + 1
+
+    def going(carry: tuple[Course, Array]) -> Array:
+        return (carry[1] < most) & ~jnp.all(carry[0].done)
+
+    return jax.lax.while_loop(going, body, (lanes, jnp.asarray(0)))[0]
+
+
+def _evaluate(
+    rule: Filter, coordinates: Coordinates, lanes: Course, data: Any, part: Array
+) -> tuple[Array, Array, Array]:
+    """Negative log posterior (L,), its gradient (L, width) and Fisher information (L, width, width)."""
+    count = part.shape[0]
+    y, ok, u, start, spread = data
+    windows = start.shape[-1]
+    # lanes times windows are the points of the filter, all windows of a lane side by side
+    tiled = [jnp.tile(a, (1,) * (a.ndim - 1) + (count,)) for a in (y, ok, u, start, spread)]
+    z = jax.vmap(lambda z, i, v, m: z.at[i].set(jnp.where(m, v, z[i])))(lanes.z, lanes.index, part, lanes.moves)
+
+    each = partial(jnp.repeat, repeats=windows, axis=-1)
+    physical = jax.vmap(coordinates.physical, out_axes=-1)
+    n_p, n_r, n_q = coordinates.sizes
+    p, noise = physical(z)
+    loud = Noise(*map(each, noise))
+    track, held = rule.track(each(p), loud, *tiled)
+    _, ok, _, _, spread = tiled
+
+    def moved(z: Array, row: Array) -> tuple[Array, Array]:
+        p = physical(z)[0]
+        value = jnp.take_along_axis(p, jnp.minimum(row, n_p - 1)[None], axis=0)[0]
+        return rule.moved(Moving(each(p), each(row), each(value)), loud, track, held, *tiled)
+
+    def along_one(index: Array) -> tuple[Array, Array]:
+        direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(index)
+        row = jnp.where(index < n_p, index, n_p)  # padding is no parameter of the model
+        return jax.jvp(lambda z: moved(z, row), (z,), (direction,))[1]
+
+    def along_noise(direction: Array) -> tuple[Array, Array]:
+        louder = lambda z: rule.louder(Noise(*map(each, physical(z)[1])), track, held, ok, spread)  # noqa: E731
+        return jax.jvp(louder, (z,), (jnp.broadcast_to(direction, z.shape),))[1]
+
+    levels = jnp.zeros((n_r + n_q, z.shape[1])).at[jnp.arange(n_r + n_q), n_p + jnp.arange(n_r + n_q)].set(1.0)
+    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one, in_axes=1)(lanes.index[:, n_r + n_q :])
+    de, ds = (jnp.concatenate(pair) for pair in zip(noises, others, strict=True))
+    ok = ok > 0
+    s = jnp.where(ok, track.variance, 1.0)
+    e = jnp.where(ok, track.innovation, 0.0)
+    de, ds = (jnp.where(ok[None], a, 0.0) for a in (de, ds))
+    weight = lanes.weight.reshape(-1)
+
+    def per_lane(a: Array) -> Array:
+        """(..., T, ny, L W) -> (L, ..., T ny W)."""
+        lead = a.shape[:-3]
+        apart = a.reshape(*lead, -1, count, windows)
+        return jnp.moveaxis(apart, -2, 0).reshape(count, *lead, -1)
+
+    loss = jnp.sum(per_lane(jnp.where(ok, 0.5 * weight[None, None] * (jnp.log(s) + e * e / s), 0.0)), axis=1)
+    first = per_lane(weight[None, None] * (e / s))
+    second = per_lane(0.5 * weight[None, None] * (1 / s - (e / s) ** 2))
+    slopes, spreads = per_lane(de), per_lane(ds)
+    gradient = jnp.einsum("ldk,lk->ld", slopes, first) + jnp.einsum("ldk,lk->ld", spreads, second)
+    root = per_lane(jnp.sqrt(weight[None, None] / s))[:, None]
+    scaled = jnp.concatenate([slopes * root, spreads * root * per_lane(jnp.sqrt(0.5 / s))[:, None]], axis=2)
+    fisher = jnp.einsum("ldk,lek->lde", scaled, scaled)
+
+    sd = coordinates.sd_of_prior()[lanes.index]
+    normal = jnp.isfinite(sd) & lanes.moves
+    inverse_variance = jnp.where(normal, 1 / sd**2, 0.0)
+    log_norm = jnp.sum(jnp.where(normal, jnp.log(jnp.where(normal, sd, 1.0)) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
+    away = part - 0.5
+    loss = loss + 0.5 * jnp.sum(inverse_variance * away**2, axis=1) + log_norm
+    gradient = jnp.where(lanes.moves, gradient + inverse_variance * away, 0.0)
+    both_move = lanes.moves[:, :, None] & lanes.moves[:, None, :]
+    fisher = jnp.where(both_move, fisher, 0.0) + jax.vmap(jnp.diag)(inverse_variance)
+    finite = jnp.isfinite(loss) & jnp.isfinite(gradient).all(axis=1) & jnp.isfinite(fisher).all(axis=(1, 2))
+    return jnp.where(finite, loss, jnp.inf), gradient, fisher
+
+
+def _stepped(now: Course, new_loss: Array, new_gradient: Array, new_fisher: Array) -> Course:
+    """One lane after its trial was evaluated: taken or not, and the next trial."""
+    better = new_loss < now.loss
+    keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
+    part, loss = keep(now.trial, now.part), keep(new_loss, now.loss)
+    gradient, fisher = keep(new_gradient, now.gradient), keep(new_fisher, now.fisher)
+    damping = jnp.where(better, jnp.maximum(now.damping / 5, 1e-6), jnp.minimum(now.damping * 8, 1e8))
+    rejected = jnp.where(better, 0, now.rejected + 1)
+    following, promised = _proposed(part, gradient, fisher, damping, now.moves)
+    done = (promised < ENOUGH) | (rejected >= MOST_REJECTED)
+    after = now._replace(
+        trial=following, part=part, loss=loss, gradient=gradient, fisher=fisher, damping=damping,
+        iteration=now.iteration + 1, done=done, rejected=rejected,
+    )  # fmt: skip
+    return jax.tree.map(lambda old, new: jnp.where(now.done, old, new), now, after)
+
+
+def _proposed(part: Array, gradient: Array, fisher: Array, damping: Array, moves: Array) -> tuple[Array, Array]:
+    """Return the next trial and the gain that the quadratic model promises."""
+    out = ((part <= 0) & (gradient > 0)) | ((part >= 1) & (gradient < 0)) | ~moves
+    free = ~out
+    matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
+    scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
+    matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
+    step = -jnp.linalg.solve(matrix, jnp.where(free, gradient, 0.0))
+    longest = jnp.max(jnp.abs(step))
+    step = step * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
+    following = jnp.clip(part + step, 0.0, 1.0)
+    step = following - part
+    return following, -(gradient @ step) - 0.5 * step @ fisher @ step

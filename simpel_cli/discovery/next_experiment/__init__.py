@@ -1,0 +1,1 @@
+"""Which experiment tells tied causes apart."""

@@ -1,0 +1,158 @@
+"""How far a model is off: one step, a horizon and a free run ahead, and how probable held-out rows are under it."""
+
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from simpel_cli.discovery.likelihood.coordinates import Coordinates
+from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Filter, Track
+from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.discovery.search.setup import Setup
+
+SETTLE = 5  # rows after which the filter knows a state that it started without
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+class Assessment(NamedTuple):
+    """Errors of one model on windows; NaN where nothing was measured.
+
+    Args:
+        one_step: (W, T, ny) measured minus predicted from all rows before.
+        variance: (W, T, ny) that the model claims for it.
+        ahead: (W, T, ny) the same from the state `horizon` rows before, without looking at rows in between.
+        free: (W, T, ny) the same from row SETTLE on without ever looking again.
+        log_likelihood: (W,) of the window's measurements.
+        free_mean: (W, T, ny) the free run itself.
+        track: of the filter.
+    """
+
+    one_step: np.ndarray
+    variance: np.ndarray
+    ahead: np.ndarray
+    free: np.ndarray
+    log_likelihood: np.ndarray
+    free_mean: np.ndarray
+    track: Track
+
+
+class Assessor:
+    """Runs one model over windows; one compiled program per shape of the windows."""
+
+    def __init__(self, plan: Setup, horizon: int) -> None:
+        self.plan, self.horizon = plan, horizon
+        self._program = _program(plan.rule, plan.coordinates.layout, horizon)
+
+    def __call__(self, z: np.ndarray, windows: Windows) -> Assessment:
+        """Assess the model at unit coordinates z."""
+        bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
+        count, batch = len(windows.episode), len(self.plan.windows.episode)
+        # batches of one size: windows to learn from and to test on share a program
+        parts = [
+            self._program(bounds, jnp.asarray(z), *(a[np.arange(i, i + batch) % count] for a in windows.arrays))
+            for i in range(0, count, batch)
+        ]
+        track, ahead, free = jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
+        ok = np.where(windows.ok > 0, 1.0, np.nan)
+        e, s = track.innovation * ok, track.variance
+        log_likelihood = -0.5 * np.nansum(np.log(s) * ok + e**2 / s + LOG_2PI * ok, axis=(1, 2))
+        rows = np.arange(windows.y.shape[1])
+        late = rows >= SETTLE
+        wrap = self._wrapped(windows.y - free) * ok * np.where(late, 1.0, np.nan)[None, :, None]
+        horizon = self._wrapped(windows.y - ahead) * ok
+        horizon[:, : SETTLE + self.horizon] = np.nan
+        e[:, :SETTLE] = np.nan
+        return Assessment(e, s, horizon, wrap, log_likelihood, free, track)
+
+    def _wrapped(self, error: np.ndarray) -> np.ndarray:
+        periodic = {q.name for q in self.plan.augmented.model.states if q.periodic}
+        around = np.array([name in periodic for name in self.plan.augmented.measured])
+        return np.where(around, (error + np.pi) % (2 * np.pi) - np.pi, error)
+
+
+def rmse(error: np.ndarray) -> np.ndarray:
+    """Root mean square over windows and rows, (ny,)."""
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.nanmean(error.reshape(-1, error.shape[-1]) ** 2, axis=0))
+
+
+def reduction_interval(
+    before: np.ndarray, after: np.ndarray, episode: np.ndarray, random: np.random.Generator, draws: int = 2000
+) -> np.ndarray:
+    """Return 95 % intervals of RMSE before / RMSE after, (2, ny), by resampling whole episodes.
+
+    Reference: Efron and Tibshirani (1993), An introduction to the bootstrap, ch. 8.
+    """
+    names = np.unique(episode)
+    sums = [[np.nansum(e[episode == n] ** 2, axis=(0, 1)) for n in names] for e in (before, after)]
+    first, second = (np.stack(s) for s in sums)
+    chosen = random.integers(0, len(names), (draws, len(names)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
+    told = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
+    interval = np.full((2, ratio.shape[1]), np.nan)
+    interval[:, told] = np.nanquantile(ratio[:, told], [0.025, 0.975], axis=0)
+    return interval
+
+
+def gain_interval(gain: np.ndarray, random: np.random.Generator, draws: int = 4000) -> tuple[float, float]:
+    """Return the 95 % interval of a sum over episodes, by resampling them; gain: (episodes,)."""
+    chosen = random.integers(0, len(gain), (draws, len(gain)))
+    low, high = np.quantile(gain[chosen].sum(axis=1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def results(assessment: Assessment, measured: tuple[str, ...], rows: float) -> dict[str, Any]:
+    """Return the figures of a model as `verdict.json` has them."""
+    return {
+        name: dict(zip(measured, (float(v) for v in rmse(error)), strict=True))
+        for name, error in (
+            ("one_step", assessment.one_step), ("horizon", assessment.ahead), ("free_run", assessment.free),
+        )
+    } | {"log_likelihood_per_step": float(assessment.log_likelihood.sum() / rows)}  # fmt: skip
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Any:
+    return jax.jit(jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0)))
+
+
+def _window(
+    rule: Filter,
+    layout: tuple[Any, ...],
+    horizon: int,
+    bounds: tuple[Array, ...],
+    z: Array,
+    y: Array,
+    ok: Array,
+    u: Array,
+    start: Array,
+    spread: Array,
+) -> tuple[Track, Array, Array]:
+    p, noise = Coordinates.of(bounds, layout).physical(z)
+    track, _ = rule.track(p, noise, y, ok, u, start, spread)
+    u_sub = rule.delayed_inputs(p, u)
+    rows = y.shape[0]
+
+    def step(x: Array, k: Array) -> tuple[Array, None]:
+        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)]), None
+
+    def from_row(x: Array, k: Array) -> Array:
+        end = jax.lax.scan(step, x, k + jnp.arange(horizon))[0]
+        last = jnp.minimum(k + horizon - 1, rows - 1)
+        return rule.measure(p, end, u_sub[last, -1])
+
+    reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
+    ahead = jnp.concatenate([y[:horizon], reached])[:rows]
+
+    def run(x: Array, k: Array) -> tuple[Array, Array]:
+        # up to SETTLE the filter's state, from there on the model alone
+        x = jnp.where(k <= SETTLE, track.mean[k], x)
+        read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1])
+        return rule.flow(p, x, u_sub[k]), read
+
+    free = jax.lax.scan(run, start, jnp.arange(rows))[1]
+    return track, ahead, free

@@ -1,0 +1,105 @@
+"""The held-out gate: an effect must help on episodes that had no part in the choice of its parameters.
+
+On a real rig, evidence alone named a friction with +79 nats while the held-out fit got worse: the gate is mandatory.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.discovery.likelihood.fit import Lane
+from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows
+from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
+from simpel_cli.discovery.search.trials import Search, Trial
+
+MOST_FOLDS = 5
+RUNAWAY = 1e4  # nats that a window costs a model that ran away in it
+
+
+class Gate(NamedTuple):
+    """Gain in held-out log-likelihood of one model over another.
+
+    Args:
+        gain: nats, summed over all held-out parts.
+        low, high: 95 % interval, by resampling episodes (or windows, where there are few episodes).
+        unit: what was held out at a time.
+        harm: whether the errors some rows ahead grow, of every channel and certainly: a model that predicts the next row
+            better and all others worse has learnt to follow.
+        passed: whether the lower end is positive and there is no harm.
+    """
+
+    gain: float
+    low: float
+    high: float
+    unit: str
+    harm: bool
+    passed: bool
+
+
+def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+    """Return what a model gains over others that lack a part of it, on episodes that they were not fitted to.
+
+    All are refitted on all but a fold of the training episodes and score that fold, for every fold. Of a few long episodes
+    windows are held out, and those that the search left out as well: they tell more, and no parameter has to be fitted again.
+    A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
+    noise, which all models have, are fitted to the fold itself; parameters and effects are not.
+    """
+    trials = (whole, *parts)
+    windows = search.plan.windows
+    unit = "episode" if len(np.unique(windows.episode)) >= LEAST_EPISODES else "window"
+    groups = windows.episode if unit == "episode" else np.arange(len(windows.episode))
+    order = np.random.default_rng(0).permutation(np.unique(groups))
+    # a single window cannot be held out: there is nothing else to fit to
+    folds = (
+        [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))] if len(order) > 1 else []
+    )
+    lanes = [Lane(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
+    found = search.fitter(lanes)
+    # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
+    found = search.fitter([Lane(o.z, search.noise, 1 - lane.weight) for o, lane in zip(found, lanes, strict=True)])
+    scored = [
+        (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)]) for i, out in enumerate(folds)
+    ]
+    if unit == "window" and search.plan.spare is not None:
+        for names, part, out in _batches(search.plan.spare, len(groups)):
+            fits = search.fitter.on(part)([Lane(t.optimum.z, search.noise, out.astype(float)) for t in trials])
+            scored.append((part, out, len(groups) + names, fits))
+    if not scored:
+        return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]
+    named = np.concatenate([names for _, _, names, _ in scored])
+    likelihood, ahead = [], []
+    for k in range(len(trials)):
+        found_by = [(assessor(fits[k].z, part), part, out) for part, out, _, fits in scored]
+        likelihood.append(np.concatenate([_likelihood(a, part)[out] for a, part, out in found_by]))
+        ahead.append(np.concatenate([a.ahead[out] for a, _, out in found_by]))
+    return [_judged(likelihood[0] - likelihood[k], ahead[k], ahead[0], named, unit) for k in range(1, len(trials))]
+
+
+def _likelihood(found: Assessment, windows: Windows) -> np.ndarray:
+    """Log-likelihood of every window, (W,); far down where the model ran away."""
+    lost = (~np.isfinite(found.track.innovation) & (windows.ok > 0)).any(axis=(1, 2))
+    return np.where(lost, -RUNAWAY, found.log_likelihood)
+
+
+def _batches(windows: Windows, size: int) -> Iterator[tuple[np.ndarray, Windows, np.ndarray]]:
+    """Cut windows into batches of one size, which share a program: names of those that count, the batch, which do."""
+    count = len(windows.episode)
+    for begin in range(0, count, size):
+        rows = np.arange(begin, begin + size)
+        counts = rows < count
+        yield rows[counts], Windows(*(a[rows % count] for a in windows)), counts
+
+
+def _judged(gains: np.ndarray, before: np.ndarray, after: np.ndarray, groups: np.ndarray, unit: str) -> Gate:
+    """Judge gains (W,) and errors ahead (W, T, ny) without and with an effect; groups: (W,)."""
+    per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
+    low, high = gain_interval(per_group, np.random.default_rng(1))
+    harm = harmful(before, after, groups)
+    return Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm)
+
+
+def harmful(before: np.ndarray, after: np.ndarray, groups: np.ndarray) -> bool:
+    """Whether the errors grow in every channel, with 97.5 % certainty; before, after: (W, T, ny), groups: (W,)."""
+    best = reduction_interval(before, after, groups, np.random.default_rng(1))[1]
+    return bool(np.isfinite(best).any() and np.all(best[np.isfinite(best)] < 1))

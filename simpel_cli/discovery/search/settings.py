@@ -1,0 +1,43 @@
+"""The `discovery:` group."""
+
+from dataclasses import dataclass
+
+from simpel_cli.discovery.search.selection import BEGINNINGS
+from simpel_cli.errors import ConfigError, check_at_least_one
+
+PAIR = 11  # unknowns of a function of two arguments beside an effect
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How the search runs.
+
+    Args:
+        horizon: how far ahead errors are judged, in rows.
+        substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 8 at most.
+        lanes: fits that run side by side in the compiled program.
+        room: unknowns of effects that a hypothesis can have at once; time grows with it.
+        rows: training rows that a search looks at, evenly spaced windows of a longer record; errors are of all test rows.
+        pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
+            Without it, they are looked for in what is left at the end.
+        beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
+    """
+
+    horizon: int = 20
+    substeps: int | None = None
+    lanes: int = 4
+    room: int = 9
+    rows: int = 3000
+    pairs: bool = False
+    beginnings: int = BEGINNINGS
+
+    def __post_init__(self) -> None:
+        if self.pairs and self.room < PAIR:
+            raise ConfigError(
+                f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
+            )
+        check_at_least_one("discovery", self, ("horizon", "lanes", "room", "rows"))
+        if self.beginnings < 0:
+            raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")
+        if self.substeps is not None and self.substeps < 1:
+            raise ConfigError(f"discovery.substeps: got {self.substeps}; it must be at least 1.")

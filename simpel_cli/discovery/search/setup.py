@@ -1,0 +1,197 @@
+"""From a simulator, measurements and a catalogue of effects to everything that a search needs."""
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.likelihood.augmented import Augmented, augment
+from simpel_cli.discovery.likelihood.coordinates import Coordinates, coordinates_of
+from simpel_cli.discovery.likelihood.filter import Filter, filter_of
+from simpel_cli.discovery.measurements import windows as windows_
+from simpel_cli.discovery.measurements.integration_steps import substeps_needed
+from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, thinned, windows_of
+from simpel_cli.errors import ConfigError, DataError
+from simulators.effects import Expression, Scales, Term, unnamed
+from simulators.effects.term import BACKLASH, DELAY, LAG
+from simulators.model import Model, ModelError
+
+LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
+MOST_SPARE = 4  # times the rows of a search: windows that are held out for free
+Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
+
+Key: TypeAlias = tuple[str, str, tuple[str, ...]]
+PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
+
+
+class Setup(NamedTuple):
+    """What a search works with."""
+
+    augmented: Augmented
+    rule: Filter
+    coordinates: Coordinates
+    windows: Windows
+    spare: Windows | None  # of the training episodes, that the search leaves out to be quick: held out for free
+    scales: Scales
+    start: np.ndarray  # (n,) unit coordinates with every effect switched off
+    lead: int
+    substeps: int
+
+
+def setup(
+    model: Model,
+    recording: Recording,
+    declared_noise: Sequence[str],
+    effects: Sequence[Expression],
+    substeps: int | None = None,
+    *,
+    pairs: bool = False,
+    kept: Collection[Key] | None = None,
+    extra: Sequence[Term] = (),
+    most_rows: int | None = None,
+) -> Setup:
+    """Attach every effect, cut the training episodes into windows and bind the filter.
+
+    Args:
+        model: the simulator.
+        recording: its measurements.
+        declared_noise: names of the channels whose noise the user declared.
+        effects: the catalogue, or what of it is to be tried.
+        substeps: Runge-Kutta steps per row; None: as many as the noise asks for.
+        pairs: offer functions of two arguments.
+        kept: terms to attach; None: all.
+        extra: terms to attach beside them.
+        most_rows: of the windows, about; None: all.
+
+    Raises:
+        DataError: too few rows.
+    """
+    rows = sum(len(e.time) for e in recording.train)
+    if rows < LEAST_ROWS:
+        raise DataError(
+            f"data: {rows} training rows; discover needs at least {LEAST_ROWS} to tell a missing effect from noise. "
+            "Record more, or leave fewer for the test split (data.split)."
+        )
+    if any(e.next_states is not None for e in recording.train):
+        raise DataError(
+            "data.layout: discover follows episodes in time; give layout `trajectories`, not `transitions`."
+        )
+    measured = measured_of(model, recording)
+    scales = scales_of(model, recording.train, measured, recording.outputs)
+    every = terms_of(model, recording, effects, pairs=pairs)
+    added = {key_of(t) for t in extra}
+    terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)] + list(extra)
+    augmented = augment(model, terms, measured)
+    # of all of them, so that windows do not depend on what is kept
+    longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
+    lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
+    if any(t.kind == BACKLASH for t in every):
+        lead = max(lead, PLAY_ROWS)
+    spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
+    windows = windows_of(
+        recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
+        at_least=4 if len(recording.train) < 4 else 1,
+    )  # fmt: skip
+    windows, spare = thinned(windows, most_rows) if most_rows is not None else (windows, None)
+    if spare is not None and most_rows is not None:
+        # whole episodes are held out where there are enough, and of very long records a part tells enough
+        spare = None if len(np.unique(windows.episode)) >= LEAST_EPISODES else thinned(spare, MOST_SPARE * most_rows)[0]
+    noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
+    r = np.array(list(noise_std.values()))
+    if substeps is None:
+        substeps = substeps_needed(model, recording.train, noise_std, scales, augmented.neutral[: len(model.params)])
+    rule = filter_of(augmented, substeps=substeps, lead=lead)
+    driven = [q.name for q in model.states if q.name in augmented.roles.dynamic]
+    typical = np.array([scales.rate[name] * np.sqrt(model.dt) for name in driven])
+    coordinates = coordinates_of(
+        augmented,
+        r,
+        np.array([name in declared_noise for name in measured]),
+        np.array([scales.size[name] for name in measured]),
+        typical * Q_BOUNDS[0],
+        typical * Q_BOUNDS[1],
+    )
+    n_p, n_r, n_q = coordinates.sizes
+    start = np.full(len(coordinates.low), 0.5)
+    knobs = np.arange(len(model.params), n_p)
+    span = coordinates.high[knobs] - coordinates.low[knobs]
+    # not cut to the bounds: a neutral value may lie beyond them
+    start[knobs] = (augmented.neutral[knobs] - coordinates.low[knobs]) / np.where(span > 0, span, 1.0)
+    start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
+    start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
+    return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps)
+
+
+def measured_of(model: Model, recording: Recording) -> tuple[str, ...]:
+    """Return the names of the measured states and outputs."""
+    return tuple([q.name for q in model.states if q.name not in recording.estimated] + list(recording.outputs))
+
+
+def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], *, pairs: bool = False) -> list[Term]:
+    """Return every effect at every place, and the functions without a name.
+
+    Raises:
+        ConfigError: an effect that names what the model does not have.
+    """
+    measured = measured_of(model, recording)
+    scales = scales_of(model, recording.train, measured, recording.outputs)
+    try:
+        named = [t for e in effects for t in e.attach(model, scales, measured)]
+    except ModelError as error:
+        raise ConfigError(str(error)) from error
+    # what is late already is calibrated: a second delay of the same input could not be told from the first
+    late = {DELAY: model.delay, LAG: model.lag}
+    return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
+
+
+def key_of(term: Term) -> Key:
+    """Return what a term is called by: effect, place, arguments."""
+    return term.effect, term.acts_on, term.depends_on
+
+
+def centre_of(model: Model) -> np.ndarray:
+    """Guess of states that nothing measures, (nx,): 0 where they have both signs, an empty tank tells no outflow."""
+    return np.array([0.0 if q.low < 0 < q.high else (q.low + q.high) / 2 for q in model.states])
+
+
+def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str], outputs: Sequence[str]) -> Scales:
+    """Read the magnitudes of all quantities off the measurements; of what is not measured, off its range and the model."""
+    states = np.concatenate([e.states for e in episodes])
+    inputs = np.concatenate([e.inputs for e in episodes])
+    values = np.concatenate([e.outputs for e in episodes])
+    size: dict[str, float] = {}
+    rate: dict[str, float] = {}
+    declared = _declared_rates(model, states, inputs)
+    for i, q in enumerate(model.states):
+        known = q.name in measured
+        size[q.name] = float(np.nanmax(np.abs(states[:, i]))) if known else max(abs(q.low), abs(q.high))
+        steps = np.concatenate([np.diff(e.states[:, i]) for e in episodes]) / model.dt
+        rate[q.name] = max(float(np.nanstd(steps)) if known else declared[i], 1e-9 * (q.high - q.low))
+    for j, q in enumerate(model.inputs):
+        size[q.name] = float(np.nanmax(np.abs(inputs[:, j])))
+    for k, name in enumerate(outputs):
+        size[name] = float(np.nanmax(np.abs(values[:, k])))
+    return Scales({k: max(v, 1e-9) for k, v in size.items()}, rate, model.dt)
+
+
+def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Root mean square of the model's rates at what was measured, anything in its range where it was not, (nx,)."""
+    random = np.random.default_rng(0)
+    rows = np.unique(np.linspace(0, len(states) - 1, min(len(states), 500)).astype(int))
+    low, high = (np.array([getattr(q, end) for q in model.states]) for end in ("low", "high"))
+    x = np.where(np.isfinite(states[rows]), states[rows], random.uniform(low, high, (len(rows), len(low))))
+    p = np.array([(q.low + q.high) / 2 for q in model.params])
+    rates = np.asarray(model.function()(x.T, np.nan_to_num(inputs[rows]).T, np.tile(p[:, None], len(rows)))[0])
+    rates = np.where(np.isfinite(rates), rates, np.nan)
+    return np.where(np.isfinite(rates).any(axis=1), np.sqrt(np.nanmean(rates**2, axis=1)), (high - low) / 2)
+
+
+def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str]) -> Windows:
+    """Cut held-out episodes into windows like those of the search, each as long as its episode."""
+    model = plan.augmented.model
+    return windows_of(
+        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
+        lead=plan.lead,
+        longest=windows_.LONGEST_TEST,
+    )  # fmt: skip

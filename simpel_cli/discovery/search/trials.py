@@ -1,0 +1,265 @@
+"""Fits of sets of effects: one term more, one less, another in its place.
+
+Every known parameter is refitted with every set: held at their old values, they would leave remainders that look like
+effects.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.search.score_test import Score, promises
+from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.errors import DataError
+
+ACCEPT = 4.5  # nats of evidence that an effect must earn
+FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
+TIE = 3.0  # nats within which two names are not told apart
+SAME = 1.0  # nats of log posterior within which only the widths of two priors differ, not what the data say
+PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
+SHARE = 0.3  # of the largest promise, likewise
+ALIKE = 0.8  # of what the term promises whose place a rival would take
+SHARE_OF_OWN = 0.4  # likewise
+KEPT = 4  # starts of a stage that are fitted in any case
+ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
+NEARLY = 0.01  # of a knob's range
+QUIETER = 0.1  # of the range of log q, than at the very start
+STARTS = 6  # of the model as it is
+
+
+def asked(effects: int) -> float:
+    """Return the nats of evidence that each of so many effects must earn."""
+    return ACCEPT + FURTHER * (effects - 1)
+
+
+class Trial(NamedTuple):
+    """One set of effects and where its fit came to rest."""
+
+    terms: tuple[int, ...]
+    optimum: Optimum
+
+
+class Stage(NamedTuple):
+    """One step of the forward selection: every candidate's fit, best first."""
+
+    before: Trial
+    trials: tuple[Trial, ...]  # each is `before` and one term more
+    screened: tuple[tuple[int, float], ...] = ()  # terms that were not fitted: standard deviation of the amplitude
+
+
+class Search:
+    """The search over sets of effects of one setup."""
+
+    def __init__(self, plan: Setup, fitter: Fitter, told: Callable[[str], None] = lambda _: None) -> None:
+        self.plan, self.fitter, self.told = plan, fitter, told
+        self.terms = plan.augmented.terms
+        n_p, n_r, n_q = plan.coordinates.sizes
+        self.always = tuple(range(len(plan.augmented.model.params))) + tuple(range(n_p, n_p + n_r + n_q))
+        self.noise = tuple(range(n_p, n_p + n_r + n_q))
+        self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
+        self.ones = np.ones(len(plan.windows.episode))
+        self.tried = 0
+        self.banned: set[int] = set()  # terms that are no candidates
+        self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
+
+    def free(self, terms: Sequence[int]) -> tuple[int, ...]:
+        """Unknowns that move when these terms are there."""
+        return self.always + tuple(row for t in terms for row in self.rows[t])
+
+    def fits(self, terms: Sequence[int]) -> bool:
+        """Whether the compiled program has room for them."""
+        return len(self.free(terms)) <= self.fitter.width
+
+    def promises(self, before: Trial, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+        """Return what each start of each term promises beside a fitted set."""
+        return promises(self.plan, self.fitter, self.fitter.width, self.free(before.terms), before.optimum.z, starts)
+
+    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Lane]:
+        """Starts of a set of terms of which one is new and begins at each of its start points."""
+        knobs = self.terms[new].knobs
+        lanes = []
+        for s in range(max(len(k.starts) for k in knobs)):
+            start = self.loud(z)
+            for row, knob in zip(self.rows[new], knobs, strict=True):
+                start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
+            lanes.append(Lane(start, self.free(terms), self.ones))
+        return lanes
+
+    def beside(self, before: Trial, new: int) -> Lane:
+        """Start of a model with one term more at the optimum without it, the term all but switched off."""
+        start = self.loud(before.optimum.z)
+        for row in self.rows[new]:
+            start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
+        return Lane(start, self.free((*before.terms, new)), self.ones)
+
+    def loud(self, z: np.ndarray) -> np.ndarray:
+        """Return a start with noise that a step in the wrong direction can hide in.
+
+        With little process noise a size that is off costs thousands of nats, and a fit creeps. And a wrong model follows
+        a sensor as if that had no noise: a better one has to find it again.
+        """
+        z = z.copy()
+        n_p, n_r, n_q = self.plan.coordinates.sizes
+        q, r = np.arange(n_p + n_r, n_p + n_r + n_q), np.arange(n_p, n_p + n_r)
+        z[q] = np.maximum(z[q], self.plan.start[q] - QUIETER)
+        z[r] = np.where(z[r] < NEARLY, self.plan.start[r], z[r])
+        return z
+
+    def off(self, z: np.ndarray, terms: Sequence[int]) -> np.ndarray:
+        """Switch terms off."""
+        z = z.copy()
+        for t in terms:
+            rows = list(self.rows[t])
+            z[rows] = self.plan.start[rows]
+        return z
+
+    def base(self) -> Trial:
+        """Calibrate the simulator as it is, from several starts."""
+        random = np.random.default_rng(0)
+        starts = [self.plan.start]
+        n = len(self.plan.augmented.model.params)
+        for _ in range(STARTS - 1):
+            z = self.plan.start.copy()
+            z[:n] = random.uniform(0.1, 0.9, n)
+            starts.append(z)
+        found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
+        if not any(np.isfinite(o.log_evidence) for o in found):
+            raise DataError(
+                f"sim: no parameters within the ranges of {self.plan.augmented.model.name} gave the measurements a finite "
+                f"likelihood, in {STARTS} tries: its states run away or its rates are not finite. Simulate it from a "
+                "measured start (`simpel simulate`), narrow sim.parameters, or guard roots, logarithms and divisions "
+                "with max(., 1e-9)."
+            )
+        return self.best((), found)
+
+    def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:
+        """Return the best of some fits of one set of terms, or an earlier one that was better."""
+        name = frozenset(terms)
+        known = [self.known[name]] if name in self.known else []
+        self.known[name] = max([*found, *known], key=lambda o: o.log_evidence)
+        return Trial(terms, self.known[name])
+
+    def starts(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Lane]]:
+        """Return every start of every candidate."""
+        return [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
+
+    def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING) -> Stage:
+        """Fit `before` with one of the candidates more, each from its promising starts; best first.
+
+        Args:
+            before: the model without it.
+            candidates: terms.
+            least: nats that a start must promise to be fitted.
+        """
+        self.tried += len(candidates)
+        starts = self.starts(before, candidates)
+        scores = self.promises(before, starts)
+        promised = np.array([score.gain for score in scores])
+        order = sorted(range(len(starts)), key=lambda i: -promised[i])
+        named = np.array([not self.terms[t].depends_on for t, _ in starts], bool)
+        finite = np.where(np.isfinite(promised), promised, 0.0)
+        # functions without a name promise much where much is left: they keep no name from being fitted
+        most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
+        going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
+        found = self.fitter([starts[i][1] for i in going])
+        fits: dict[int, list[Optimum]] = {}
+        for i, optimum in zip(going, found, strict=True):
+            fits.setdefault(starts[i][0], []).append(optimum)
+        # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
+        astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
+        for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
+            fits[t].append(optimum)
+        trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
+        left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
+        ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
+        return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
+
+    def best_named(self, trials: Sequence[Trial], least: float = -np.inf) -> Trial | None:
+        """Best trial with a named new effect; a more general name must earn its generality over a simpler one.
+
+        Args:
+            trials: best first.
+            least: evidence that the simpler one must reach.
+        """
+        named = [t for t in trials if not self.terms[t.terms[-1]].depends_on]
+        if not named:
+            return None
+        best = named[0]
+        own = self.terms[best.terms[-1]]
+        for other in named[1:]:
+            term = self.terms[other.terms[-1]]
+            simpler = term.effect in own.generalises and term.acts_on == own.acts_on
+            value = other.optimum.log_evidence
+            if simpler and value > least and best.optimum.log_evidence - value < ACCEPT:
+                best, own = other, term
+        return best
+
+    def candidates(self, terms: Sequence[int]) -> list[int]:
+        """Terms that can still be added."""
+        taken = self.banned.union(terms)
+        return [t for t in range(len(self.terms)) if t not in taken and self.fits((*terms, t))]
+
+    def less(self, current: Trial, rest: tuple[int, ...]) -> list[Lane]:
+        """Starts of a set of terms that has fewer than the current one."""
+        z = self.off(current.optimum.z, tuple(t for t in current.terms if t not in rest))
+        n_p, n_r, n_q = self.plan.coordinates.sizes
+        loud = z.copy()  # the noise that the terms explained has to go somewhere
+        loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
+        return [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
+
+    def part(self, current: Trial, rest: tuple[int, ...]) -> Trial:
+        """Return the best fit of some of a model's terms, which is made if there is none yet."""
+        return self.best(rest, () if frozenset(rest) in self.known else self.fitter(self.less(current, rest)))
+
+    def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
+        """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""
+        while current.terms:
+            without = self.without(current)
+            gains = [current.optimum.log_evidence - t.optimum.log_evidence for t in without]
+            weakest = int(np.argmin(gains))
+            if gains[weakest] >= asked(max(1, sum(not self.terms[t].depends_on for t in current.terms))):
+                return current, tuple(gains), without
+            current = without[weakest]
+        return current, (), []
+
+    def without(self, current: Trial) -> list[Trial]:
+        """Fit every set that lacks one of the terms."""
+        sets = [tuple(t for t in current.terms if t != gone) for gone in current.terms]
+        lanes = [lane for rest in sets for lane in self.less(current, rest)]
+        found = self.fitter(lanes)
+        return [self.best(rest, found[2 * i : 2 * i + 2]) for i, rest in enumerate(sets)]
+
+    def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
+        """Return the trials in which another name takes the place of the term that `rest` lacks, and does as well."""
+        (own,) = set(chosen.terms) - set(rest.terms)
+        candidates = [t for t in self.candidates(rest.terms) if t != own]
+        starts = self.starts(rest, [own, *candidates])
+        promised = [
+            (t, score.gain)
+            for (t, _), score in zip(starts, self.promises(rest, starts), strict=True)
+            if np.isfinite(score.gain)
+        ]
+        earned = chosen.optimum.log_evidence - rest.optimum.log_evidence
+        most = max((gain for t, gain in promised if t == own), default=earned)
+        # what promises as much may be the same to the data: it begins where the chosen model ended, too
+        alike = list(dict.fromkeys(t for t, gain in promised if t != own and gain > ALIKE * most))
+        z = self.off(chosen.optimum.z, (own,))
+        starts = [(t, lane) for t in alike for lane in self.lanes((*rest.terms, t), t, z)]
+        for (t, _), optimum in zip(starts, self.fitter([lane for _, lane in starts]), strict=True):
+            self.best((*rest.terms, t), [optimum])
+        trials = self.add(rest, candidates, max(PROMISING, SHARE_OF_OWN * most)).trials
+        fitted = {t.terms[-1] for t in trials}
+        trials += tuple(self.best((*rest.terms, t), ()) for t in alike if t not in fitted)
+        return tuple(t for t in trials if self.as_good(t, chosen, own))
+
+    def as_good(self, trial: Trial, chosen: Trial, own: int) -> bool:
+        """Whether a trial does as well as the chosen model whose term `own` its last one replaces."""
+        term, here, there = self.terms[trial.terms[-1]], trial.optimum, chosen.optimum
+        if term.depends_on:
+            return here.log_evidence >= there.log_evidence + ACCEPT
+        if self.terms[own].effect in term.generalises:
+            return False
+        fits = len(term.knobs) <= len(self.terms[own].knobs) and here.loss <= there.loss + SAME
+        return fits or here.log_evidence >= there.log_evidence - TIE

@@ -1,0 +1,107 @@
+"""The corrected simulator as YAML that `simpel fit` reads: the declared one, with the effects as terms."""
+
+import re
+from typing import Any
+
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.verdict.verdict import Z95, interval_of
+from simulators.effects import Term
+from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR
+from simulators.model import Model
+
+DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
+_SENSOR = "a simulator says what happens, not what a sensor reads: correct the measurements instead"
+CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
+    BACKLASH: "a transition cannot tell on which side of its play an input is: that may have been settled long ago"
+}
+
+
+def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
+    """Return name, YAML and what could not be written, each with the reason.
+
+    Priors of the effects' parameters are normal, with the 95 % interval of the fit for range; the simulator's own
+    keep the ranges that the user declared.
+
+    Args:
+        sim: the `sim:` node, as declared.
+        model: that it declares.
+        search: that was run.
+        trial: the chosen effects.
+    """
+    terms = [search.terms[t] for t in trial.terms]
+    name = f"{sim['name']}_with_" + "_and_".join(t.effect for t in terms)
+    taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
+    taken |= {*model.fixed, *(sim.get("parameters") or {})}
+    written: list[Term] = []
+    names: dict[str, str] = {}
+    parameters: dict[str, Any] = {}
+    for index, term in sorted(zip(trial.terms, terms, strict=True)):
+        if term.kind in CANNOT:
+            continue
+        written.append(term)
+        for knob, row in zip(term.knobs, search.rows[index], strict=True):
+            short = knob.label if knob.label not in taken else f"{knob.label}_{term.acts_on.replace(', ', '_')}"
+            short = short if short not in taken else knob.name
+            taken.add(short)
+            names[knob.name] = short
+            span = interval_of(search, trial, row, Z95)
+            low, high = sorted((span["low"], span["high"]))
+            parameters[short] = (
+                {"unit": knob.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
+            )
+    write = _declared if sim.get("_target_") == DECLARED else _extended
+    node = write(sim, name, written, names, parameters)
+    return name, node, [f"{t.label} ({CANNOT[t.kind]})" for t in terms if t.kind in CANNOT]
+
+
+def _extended(
+    sim: dict[str, Any], name: str, terms: list[Term], names: dict[str, str], parameters: dict[str, Any]
+) -> dict[str, Any]:
+    """Return a simulator whose equations are in Python with the terms beside it, for `simulators.extended.Extended`."""
+    inputs: dict[str, dict[str, str]] = {}
+    dynamics: dict[str, str] = {}
+    for term in terms:
+        if term.kind in (DELAY, LAG):
+            inputs.setdefault(term.acts_on, {})[term.kind] = names[term.knobs[0].name]
+        elif term.kind == INPUT:
+            before = inputs.setdefault(term.acts_on, {}).get("value", term.acts_on)
+            inputs[term.acts_on]["value"] = _renamed(term.expression, names | {term.acts_on: f"({before})"})
+        for state, text in term.rates.items():
+            own = {} if term.several else {"rate": f"rate_{state}"}
+            added = f"({_renamed(text, names | own)})"
+            dynamics[state] = f"{dynamics[state]} + {added}" if state in dynamics else added
+    parts = {"parameters": parameters, "inputs": inputs, "dynamics": dynamics}
+    return {"_target_": EXTENDED, "name": name, "base": sim, **{key: part for key, part in parts.items() if part}}
+
+
+def _declared(
+    sim: dict[str, Any], name: str, terms: list[Term], names: dict[str, str], parameters: dict[str, Any]
+) -> dict[str, Any]:
+    """Return a declared simulator with the terms, in the order in which they were attached, as the augmented model has them."""
+    node = {key: dict(value) if isinstance(value, dict) else value for key, value in sim.items()}
+    node["name"] = name
+    node["parameters"] = (node.get("parameters") or {}) | parameters
+    given: dict[str, str] = {}
+    for term in terms:
+        if term.kind in (DELAY, LAG):
+            own = node["inputs"][term.acts_on]
+            node["inputs"][term.acts_on] = own | {term.kind: names[term.knobs[0].name]}
+        elif term.kind == INPUT:
+            own = {term.acts_on: given.get(term.acts_on, term.acts_on)}
+            given[term.acts_on] = f"({_renamed(term.expression, names | own)})"
+    # what the simulator says with the inputs as they act: every term adds to that, and takes its rates from that
+    base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
+    rates = {f"rate_{state}": f"({text})" for state, text in base.items()}
+    node["dynamics"] = dict(base)
+    for output, own in (node.get("outputs") or {}).items():
+        new = _renamed(str(own["expression"] if isinstance(own, dict) else own), given)
+        node["outputs"][output] = own | {"expression": new} if isinstance(own, dict) else new
+    for term in terms:
+        for state, text in term.rates.items():
+            swap = names | given | (rates if term.several else {"rate": rates[f"rate_{state}"]})
+            node["dynamics"][state] += f" + ({_renamed(text, swap)})"
+    return node
+
+
+def _renamed(text: str, swap: dict[str, str]) -> str:
+    return re.sub(r"(?<![\w.])[A-Za-z_]\w*", lambda m: swap.get(m[0], m[0]), text)

@@ -1,0 +1,125 @@
+"""What is left when the search ends, in words and numbers: a function without a name, a swing, or errors with a memory."""
+
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.discovery.likelihood.whiteness import memory
+from simpel_cli.discovery.search.disturbances import Swing
+from simpel_cli.discovery.search.errors_ahead import Assessment
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.trials import Search, Trial
+from simulators.effects.expression import per
+
+ALIKE = 0.3  # of an input's variance, at the period of a swing
+
+
+def remainder_of(
+    search: Search, selection: Selection, swing: Swing | None, learnt: Assessment
+) -> dict[str, Any] | None:
+    """Return `remainder` of `verdict.json`; None where nothing is left.
+
+    Args:
+        search: that was run.
+        selection: what it chose, and a function without a name that the data still ask for.
+        swing: a force of time that they ask for.
+        learnt: the corrected model on the windows that it was fitted to.
+    """
+    found = _function(search, selection) or (swing and _swinging(search, swing))
+    return found or _followed(search, selection.chosen, learnt)
+
+
+def dependence(remainder: dict[str, Any]) -> str:
+    """Return what a remainder depends on, in words."""
+    period = remainder.get("period")
+    return ", ".join(remainder["depends_on"]) + (f", with a period of about {period:.3g} s" if period else "")
+
+
+def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
+    if selection.remainder is None:
+        return None
+    term, gain = selection.remainder
+    scale = search.plan.scales.rate[term.acts_on]
+    level = noise_of(search, selection.chosen)[1]
+    unit = term.knobs[0].unit
+    return {
+        "acts_on": term.acts_on,
+        "depends_on": list(term.depends_on),
+        "rms": level / np.sqrt(search.plan.augmented.model.dt),
+        "unit": unit,
+        "log_evidence_gain": gain,
+        "description": f"something acts on d({term.acts_on})/dt that depends on {', '.join(term.depends_on)} and is "
+        f"no effect of the catalogue (typical rate of the data: {scale:.3g} {unit})",
+    }
+
+
+def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
+    return {
+        "acts_on": swing.acts_on,
+        "depends_on": ["time"],
+        "rms": swing.rms,
+        "unit": _unit(search, swing.acts_on),
+        "log_evidence_gain": swing.gain,
+        "period": swing.period,
+        "description": f"something acts on d({swing.acts_on})/dt, or on a sensor of it, "
+        f"that {swing.how}{_like(search, swing.period)}",
+    }
+
+
+def _like(search: Search, period: float | None) -> str:
+    """Say which inputs have the same period: then it may be a function of them after all."""
+    if period is None:
+        return ""
+    model, plan = search.plan.augmented.model, search.plan
+    rows = plan.windows.ok.shape[1]
+    u = plan.windows.u[:, plan.lead : plan.lead + rows]
+    phase = 2 * np.pi * model.dt / period * np.arange(rows)
+    waves = np.stack([np.ones(rows), np.cos(phase), np.sin(phase)], axis=1)
+    left = u - np.einsum("tk,wkj->wtj", waves, np.linalg.pinv(waves) @ u)
+    spread = ((u - u.mean(axis=1, keepdims=True)) ** 2).sum(axis=(0, 1))
+    names = [q.name for q, all_of_it, rest in zip(model.inputs, spread, (left**2).sum(axis=(0, 1)), strict=True)
+             if rest < (1 - ALIKE) * all_of_it]  # fmt: skip
+    return f", as {' and '.join(names)} does, of which it may be a function" if names else ""
+
+
+def _unit(search: Search, state: str) -> str:
+    """Return the unit of a state's rate."""
+    return next((per(q.unit, "s") for q in search.plan.augmented.model.states if q.name == state), "")
+
+
+def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, Any] | None:
+    """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
+    errors = learnt.one_step / np.sqrt(learnt.variance)
+    found = {
+        name: told
+        for j, name in enumerate(search.plan.augmented.measured)
+        if (told := memory(errors[:, :, j])) is not None
+    }
+    if not found:
+        return None
+    worst = max(found, key=lambda name: abs(found[name][0]))
+    r, lag = found[worst]
+    apart = "from row to row" if lag == 1 else f"between rows that are {lag} apart"
+    model, roles = search.plan.augmented.model, search.plan.augmented.roles
+    speed = {position: velocity for velocity, position in roles.velocity.items() if position}
+    acts_on = speed.get(worst, worst)
+    return {
+        "acts_on": acts_on,
+        "depends_on": ["time"],
+        "rms": noise_of(search, chosen)[1] / np.sqrt(model.dt),
+        "unit": _unit(search, acts_on),
+        "log_evidence_gain": None,
+        "description": f"something acts on d({acts_on})/dt that is no function of the states and inputs of the model: the "
+        f"one-step errors of {worst} have a memory (correlation {r:.2f} {apart}); it depends on time, or on what was not "
+        "recorded",
+    }
+
+
+def noise_of(search: Search, trial: Trial) -> tuple[list[float], float]:
+    """Measurement noise per channel, and the largest process noise, per square root of a second."""
+    n_p, n_r, n_q = search.plan.coordinates.sizes
+    r, q = (
+        [search.plan.coordinates.value(i, trial.optimum.z[i]) for i in rows]
+        for rows in (range(n_p, n_p + n_r), range(n_p + n_r, n_p + n_r + n_q))
+    )
+    return r, max(q, default=0.0)

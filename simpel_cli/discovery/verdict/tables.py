@@ -1,0 +1,213 @@
+"""Tables of a search: what every figure and table of its report is made of."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode
+from simpel_cli.discovery.likelihood.latent_force import Force
+from simpel_cli.discovery.measurements.windows import Windows, pieces
+from simpel_cli.discovery.search.errors_ahead import SETTLE, Assessment
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.trials import Search, asked
+from simpel_cli.discovery.verdict.verdict import interval_of
+
+DRAWS = 2000  # of a bootstrap
+HORIZONS = ("one_step", "horizon", "free_run")
+Columns = dict[str, np.ndarray]
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Stack tables with the same columns."""
+    return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]} if parts else {}
+
+
+def residual_columns(
+    model: str,
+    split: str,
+    found: Force,
+    effect: np.ndarray,
+    windows: Windows,
+    episodes: Sequence[Episode],
+    driven: Mapping[int, tuple[str, str]],
+    arguments: tuple[Sequence[str], Sequence[str]],
+) -> Columns:
+    """Return the latent force of one model, a row per row of an episode and driven state.
+
+    Args:
+        model: before, without (the corrected parameters, effects switched off) or after.
+        split: train or test.
+        found: force and smoothed states, angles between -pi and pi.
+        effect: (W, T - 1, nx) what the effects that were found do in these states, per second.
+        windows: of the split.
+        episodes: of the split.
+        driven: row of the state -> (its name, unit of its force).
+        arguments: names of the columns of states and of inputs, see `column_names`.
+    """
+    parts = []
+    lead = windows.u.shape[1] - windows.y.shape[1]
+    for w, piece in enumerate(pieces(windows, episodes)):
+        n = len(piece.rows) - 1
+        for i, (name, unit) in driven.items():
+            table: Columns = {
+                "model": np.full(n, model), "split": np.full(n, split), "episode": np.full(n, piece.episode),
+                "row": piece.rows[:n], "time": piece.time[:n], "acts_on": np.full(n, name), "unit": np.full(n, unit),
+                "force": found.force[w, :n, i], "std": found.std[w, :n, i], "effect": effect[w, :n, i],
+            }  # fmt: skip
+            table |= {column: found.state[w, :n, j] for j, column in enumerate(arguments[0])}
+            table |= {column: windows.u[w, lead : lead + n, j] for j, column in enumerate(arguments[1])}
+            parts.append(table)
+    return joined(parts)
+
+
+RESERVED = ("model", "split", "episode", "row", "time", "acts_on", "unit", "force", "std", "effect")
+
+
+def column_names(names: Sequence[str]) -> list[str]:
+    """Return names of quantities as columns of the residual's table; one that is taken there gets an underscore."""
+    return [f"{n}_" if n in RESERVED else n for n in names]
+
+
+def innovation_columns(
+    model: str, split: str, found: Assessment, windows: Windows, episodes: Sequence[Episode], measured: Sequence[str]
+) -> Columns:
+    """Return one-step errors and the standard deviation that the model claims for them."""
+    parts = []
+    for w, piece in enumerate(pieces(windows, episodes)):
+        n = len(piece.rows)
+        for j, name in enumerate(measured):
+            parts.append(
+                {
+                    "model": np.full(n, model), "split": np.full(n, split), "episode": np.full(n, piece.episode),
+                    "row": piece.rows, "time": piece.time, "output": np.full(n, name),
+                    "innovation": found.one_step[w, :n, j], "std": np.sqrt(found.variance[w, :n, j]),
+                }
+            )  # fmt: skip
+    return joined(parts)
+
+
+def trajectory_columns(
+    before: Assessment,
+    after: Assessment,
+    windows: Windows,
+    episodes: Sequence[Episode],
+    measured: Mapping[str, str],
+) -> Columns:
+    """Return measured values and free runs, from the row on from which no measurement was looked at.
+
+    Args:
+        before: the calibrated simulator on the windows.
+        after: the corrected one.
+        windows: of the test split.
+        episodes: of the test split.
+        measured: name -> unit.
+    """
+    parts = []
+    for w, piece in enumerate(pieces(windows, episodes)):
+        n = len(piece.rows)
+        for j, (name, unit) in enumerate(measured.items()):
+            parts.append(
+                {
+                    "episode": np.full(n, piece.episode), "row": piece.rows, "time": piece.time,
+                    "output": np.full(n, name), "unit": np.full(n, unit),
+                    "measured": np.where(windows.ok[w, :n, j] > 0, windows.y[w, :n, j], np.nan),
+                    "before": before.free_mean[w, :n, j], "after": after.free_mean[w, :n, j],
+                    "free": np.arange(n) >= SETTLE,
+                }
+            )  # fmt: skip
+    return joined(parts)
+
+
+def error_columns(
+    before: Assessment, after: Assessment, windows: Windows, measured: Mapping[str, str], noise: Mapping[str, float]
+) -> Columns:
+    """Return RMSE before and after by horizon with 95 % intervals, by resampling whole episodes; NaN for one episode.
+
+    Args:
+        before: the calibrated simulator on the windows.
+        after: the corrected one.
+        windows: of the test split.
+        measured: name -> unit.
+        noise: name -> standard deviation of the measurement noise.
+    """
+    rows: list[dict[str, Any]] = []
+    episodes = np.unique(windows.episode)
+    chosen = np.random.default_rng(3).integers(0, len(episodes), (DRAWS, len(episodes)))
+    for horizon in HORIZONS:
+        pair = [{"one_step": a.one_step, "horizon": a.ahead, "free_run": a.free}[horizon] for a in (before, after)]
+        sums = [np.stack([_squares(e[windows.episode == n]) for n in episodes]) for e in pair]
+        whole = [_root(s.sum(axis=0)) for s in sums]
+        drawn = [_root(s[chosen].sum(axis=1)) for s in sums]
+        for j, (name, unit) in enumerate(measured.items()):
+            row = {"horizon": horizon, "output": name, "unit": unit, "noise_floor": noise[name]}
+            row |= _estimate("before", whole[0][j], drawn[0][:, j], len(episodes))
+            row |= _estimate("after", whole[1][j], drawn[1][:, j], len(episodes))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio, ratios = whole[0][j] / whole[1][j], drawn[0][:, j] / drawn[1][:, j]
+            rows.append(row | _estimate("reduction", ratio, ratios, len(episodes)))
+    return as_columns(rows)
+
+
+def _squares(error: np.ndarray) -> np.ndarray:
+    """Sum of squares and number of errors, (2, ny)."""
+    return np.stack([np.nansum(error**2, axis=(0, 1)), np.isfinite(error).sum(axis=(0, 1))])
+
+
+def _root(sums: np.ndarray) -> np.ndarray:
+    """Return the root mean square of (..., 2, ny) sums; NaN where there is nothing."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sqrt(sums[..., 0, :] / sums[..., 1, :])
+
+
+def _estimate(name: str, value: float, drawn: np.ndarray, episodes: int) -> dict[str, float]:
+    """Value and 95 % interval; none from one episode, and none where a draw had nothing to count."""
+    low, high = (np.nan, np.nan) if episodes < 2 else np.quantile(drawn, [0.025, 0.975])
+    return {name: float(value), f"{name}_low": float(low), f"{name}_high": float(high)}
+
+
+def parameter_columns(search: Search, selection: Selection) -> Columns:
+    """Return value and 90 % interval of every parameter, before and after, with its declared range.
+
+    Parameters of effects have no `before`, and `effect` says whose they are.
+    """
+    own = [(q.name, "", q.unit, q.low, q.high, i) for i, q in enumerate(search.plan.augmented.model.params)]
+    added = [
+        (knob.label, search.terms[t].label, knob.unit, knob.low, knob.high, row)
+        for t in selection.chosen.terms
+        for knob, row in zip(search.terms[t].knobs, search.rows[t], strict=True)
+    ]
+    rows = [
+        {"parameter": name, "effect": effect, "unit": unit, "model": model, "range_low": low, "range_high": high}
+        | interval_of(search, trial, row)
+        for name, effect, unit, low, high, row in own + added
+        for model, trial in (("before", selection.base), ("after", selection.chosen))
+        if not (effect and model == "before")
+    ]
+    return as_columns(rows)
+
+
+def candidate_columns(search: Search, selection: Selection) -> Columns:
+    """Return every candidate of every step: what it would add to the evidence, and whether that step added it."""
+    rows = []
+    for step, stage in enumerate(selection.stages, start=1):
+        following = selection.stages[step].before.terms if step < len(selection.stages) else selection.chosen.terms
+        for trial in stage.trials:
+            term = search.terms[trial.terms[-1]]
+            rows.append(
+                {
+                    "step": step, "effect": term.effect, "acts_on": term.acts_on, "depends_on": ",".join(term.depends_on),
+                    "expression": term.formula,
+                    "log_evidence_gain": trial.optimum.log_evidence - stage.before.optimum.log_evidence,
+                    "asked": asked(len(stage.before.terms) + 1),
+                    "accepted": set(trial.terms) == set(following),
+                    "kept": trial.terms[-1] in selection.chosen.terms,
+                    "converged": trial.optimum.converged,
+                }
+            )  # fmt: skip
+    return as_columns(rows)
+
+
+def as_columns(rows: Sequence[Mapping[str, Any]]) -> Columns:
+    """Turn rows into columns."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]} if rows else {}

@@ -1,0 +1,86 @@
+"""Effects that the data cannot show at all, whatever their size: neither found nor ruled out.
+
+At an effect's start points, with everything else that moves refitted, its first knob has the information
+
+    S = F_kk - F_kb F_bb^-1 F_bk
+
+in units of the knob's range. Below that of the range itself, 12, the data add nothing to what was known before.
+
+Reference: Cox and Hinkley (1974), Theoretical statistics, 9.3 (information on one parameter among several).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode
+from simpel_cli.discovery.likelihood.fit import LEAST_CURVATURE
+from simpel_cli.discovery.search.trials import Search, Trial
+
+FAULTS = ("kinematics", "stale")  # checks of the data that can hide or feign an effect
+SHOWN = 6  # names in a sentence
+SURPRISING = 1.5  # times the standard deviation that the model claims, on episodes that it did not see
+
+
+def unseen(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[dict[str, str]]:
+    """Return the effects that these data do not test, and why: name, acts_on, reason.
+
+    Args:
+        search: that was run.
+        chosen: the model that it ended with.
+        episodes: that it was run on.
+    """
+    here = set(chosen.terms)
+    asked = [t for t in search.candidates(chosen.terms) if not search.terms[t].depends_on and t not in here]
+    starts = [(t, lane) for t in asked for lane in search.lanes((*chosen.terms, t), t, chosen.optimum.z)]
+    seen = set()
+    for (t, lane), optimum in zip(starts, search.fitter([lane for _, lane in starts], 1), strict=True):
+        if _information(optimum.fisher, lane.free.index(search.rows[t][0])) >= LEAST_CURVATURE:
+            seen.add(t)
+    still = _still(search, episodes)
+    return [
+        {
+            "name": search.terms[t].effect, "acts_on": search.terms[t].acts_on,
+            "reason": f"{search.terms[t].acts_on} never changes" if search.terms[t].acts_on in still
+            else "these data would look the same with any of its sizes",
+        }
+        for t in asked if t not in seen
+    ]  # fmt: skip
+
+
+def in_words(entries: Sequence[dict[str, str]]) -> list[str]:
+    """Return what was not tested as a few words each, long lists cut."""
+    named = [f"{e['name'].replace('_', ' ')} on {e['acts_on']} ({e['reason']})" for e in entries[:SHOWN]]
+    return [*named, f"{len(entries) - SHOWN} effects more"] if len(entries) > SHOWN else named
+
+
+def caveats(found: dict[str, Any]) -> str:
+    """Return what a verdict must add: what was not tested, what is wrong with the data, whether the test surprised it."""
+    text = ""
+    if found["verdict"] in ("none", "unexplained"):
+        names = in_words(found["not_tested"])
+        text += f" Not tested by these data: {', '.join(names)}." if names else ""
+        faults = [c["check"] for c in found["data_checks"] if not c["ok"] and c["check"] in FAULTS]
+        text += f" The data have faults that come first: {', '.join(faults)}." if faults else ""
+    name, most = max(found["error"]["surprise"].items(), key=lambda entry: np.nan_to_num(entry[1]))
+    if most > SURPRISING:
+        text += (
+            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times what the model expects: they may "
+            "go where the training episodes did not."
+        )
+    return text
+
+
+def _information(fisher: np.ndarray, k: int) -> float:
+    if not np.isfinite(fisher).all():
+        return np.inf
+    others = [i for i in range(len(fisher)) if i != k]
+    base = fisher[np.ix_(others, others)] + LEAST_CURVATURE * np.eye(len(others))
+    cross = fisher[others, k]
+    return float(fisher[k, k] - cross @ np.linalg.solve(base, cross))
+
+
+def _still(search: Search, episodes: Sequence[Episode]) -> set[str]:
+    inputs = np.concatenate([e.inputs for e in episodes])
+    return {q.name for j, q in enumerate(search.plan.augmented.model.inputs) if np.ptp(inputs[:, j]) == 0}

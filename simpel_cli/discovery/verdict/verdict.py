@@ -1,0 +1,255 @@
+"""What a search says in the end: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
+
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.data.recording import Check
+from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
+from simpel_cli.discovery.search.gate import Gate
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.setup import Q_BOUNDS, key_of
+from simpel_cli.discovery.search.trials import Search, Trial, asked
+from simpel_cli.discovery.verdict.aliases import twins
+from simpel_cli.discovery.verdict.remainder import dependence, noise_of
+
+EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
+LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
+SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
+Z90, Z95 = 1.6448536269514722, 1.959963984540054
+
+
+def verdict_of(
+    search: Search,
+    selection: Selection,
+    gates: list[Gate],
+    before: Assessment,
+    after: Assessment,
+    remainder: dict[str, Any] | None,
+    windows: Windows,
+    checks: tuple[Check, ...],
+    horizon: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """Return `verdict.json`.
+
+    Args:
+        search: that was run.
+        selection: what it chose; terms that failed the gate are left out already.
+        gates: one per chosen term, in order.
+        before: the calibrated simulator on the test windows.
+        after: the corrected one.
+        remainder: what is left unexplained (`remainder_of`).
+        windows: the test windows.
+        checks: of the data.
+        horizon: rows.
+        seconds: of the search.
+    """
+    chosen = selection.chosen
+    effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i in range(len(chosen.terms))]
+    different = [_distinct(e) for e in effects]
+    if not effects:
+        kind = UNEXPLAINED if remainder else NONE
+    else:
+        kind = EFFECT if all(len(d) == 1 for d in different) else AMBIGUOUS
+    measured = search.plan.augmented.measured
+    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
+    found = {
+        "verdict": kind,
+        "summary": "",
+        "effects": effects,
+        "interval": 0.9,
+        "remainder": remainder,
+        "parameters": _parameters(search, selection.base, chosen),
+        "error": {
+            "split": "test",
+            "episodes": len(np.unique(windows.episode)),
+            "unit_note": "RMSE in data units, per measured output",
+            "before": results(before, measured, rows),
+            "after": results(after, measured, rows),
+            "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
+            "horizon_steps": horizon,
+            "surprise": dict(
+                zip(measured, (float(v) for v in rmse(after.one_step / np.sqrt(after.variance))), strict=True)
+            ),
+        },
+        "noise_floor": dict(zip(measured, noise_of(search, chosen)[0], strict=True)),
+        "process_noise": {
+            "before": noise_of(search, selection.base)[1],
+            "after": noise_of(search, chosen)[1],
+            "share_after": _shaken(search, chosen),
+        },
+        "gate": [g._asdict() for g in gates],
+        "not_found": _not_found(search, selection),
+        "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
+        "next_experiment": None,
+        "corrected_sim": None,
+        "candidates_tried": search.tried,
+        "seconds": round(seconds, 2),
+    }
+    return found | {"summary": sentence(found, before, after, measured)}
+
+
+def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
+    """Return the errors on the test windows after each accepted effect, from the calibrated simulator on."""
+    measured = search.plan.augmented.measured
+    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    steps, before = [], set[int]()
+    for trial in selection.path:
+        added = [search.terms[t].label for t in trial.terms if t not in before]
+        before = set(trial.terms)
+        steps.append({"added": added, "error": results(assessor(trial.optimum.z, windows), measured, rows)})
+    return steps
+
+
+def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[str, float]:
+    """Return value and 90 % interval of one unknown of a fit, in its unit; z: half width in standard deviations."""
+    coordinates, optimum = search.plan.coordinates, trial.optimum
+    at, sd = float(optimum.z[row]), 0.0
+    if row in optimum.free:
+        i = optimum.free.index(row)
+        at, sd = float(np.clip(optimum.centre[i], 0, 1)), float(np.sqrt(optimum.covariance[i, i]))
+    low, high = (float(np.clip(at + s * z * sd, 0, 1)) for s in (-1, 1))
+    return {
+        "value": coordinates.value(row, at),
+        "low": coordinates.value(row, low),
+        "high": coordinates.value(row, high),
+    }
+
+
+def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
+    term = search.terms[selection.chosen.terms[i]]
+    rows = search.rows[selection.chosen.terms[i]]
+    others = [(search.terms[t.terms[-1]], t) for t in selection.classes[i]]
+    own = (selection.chosen.terms[i], selection.chosen)
+    alike = {key_of(other) for other, t in others if twins(search, selection.chosen, own, (t.terms[-1], t))}
+    same = [other.effect for other, _ in others if key_of(other) in alike and other.effect != term.effect]
+    members = [{"name": term.effect, "acts_on": term.acts_on, "same": True}] + [
+        {"name": t.effect, "acts_on": t.acts_on, "same": key_of(t) in alike or t.effect in term.same_as}
+        for t, _ in others
+    ]
+    places = {m["name"]: m["acts_on"] for m in members[::-1]}
+    before = noise_of(search, selection.base)[1]
+    after = noise_of(search, selection.chosen)[1]
+    return {
+        "name": term.effect,
+        "acts_on": term.acts_on,
+        "meaning": term.meaning,
+        "class": list(dict.fromkeys(m["name"] for m in members)),
+        "class_acts_on": places,
+        "class_members": members,
+        "same_as": list(dict.fromkeys([*term.same_as, *same])),
+        "log_evidence_gain": selection.gains[i],
+        "held_out_gain": None if gate is None else gate._asdict(),
+        "parameters": {
+            knob.label: interval_of(search, selection.chosen, row) | {"unit": knob.unit}
+            for knob, row in zip(term.knobs, rows, strict=True)
+        },
+        "share_of_residual": float(1 - (after / before) ** 2) if before > 0 else 0.0,
+    }
+
+
+def _distinct(effect: dict[str, Any]) -> list[str]:
+    """Names of a class that some data could tell apart, with the place where a name has several."""
+    first, *others = effect["class_members"]
+    return _labels(effect, [first, *(m for m in others if not m["same"])])
+
+
+def _labels(effect: dict[str, Any], members: list[dict[str, Any]]) -> list[str]:
+    """Members of a class in words; with the place where a name acts on several."""
+    names = [m["name"] for m in effect["class_members"]]
+    words = [(m["name"].replace("_", " "), names.count(m["name"]) > 1, m["acts_on"]) for m in members]
+    return list(dict.fromkeys(f"{name} on {place}" if several else name for name, several, place in words))
+
+
+def _parameters(search: Search, base: Trial, chosen: Trial) -> dict[str, Any]:
+    return {
+        q.name: {"before": interval_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
+        for i, q in enumerate(search.plan.augmented.model.params)
+    }
+
+
+def _shaken(search: Search, trial: Trial) -> float:
+    """Return the largest process noise in a row over the typical change of its state in a row."""
+    coordinates = search.plan.coordinates
+    n_p, n_r, n_q = coordinates.sizes
+    rows = range(n_p + n_r, n_p + n_r + n_q)
+    return max(
+        (coordinates.value(i, trial.optimum.z[i]) / coordinates.value(i, 1.0) * Q_BOUNDS[1] for i in rows), default=0
+    )
+
+
+def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
+    """Return the smallest size of every other effect that would have been seen: it earns what one more effect is asked."""
+    last = selection.stages[-1]
+    if last.before.terms != selection.chosen.terms:
+        return []
+    seen: list[tuple[int, float, float | None]] = [(t, sd, None) for t, sd in last.screened]
+    for trial in last.trials:
+        gain = trial.optimum.log_evidence - last.before.optimum.log_evidence
+        i = trial.optimum.free.index(search.rows[trial.terms[-1]][0])
+        if gain > LOST:
+            seen.append((trial.terms[-1], float(np.sqrt(trial.optimum.covariance[i, i])), float(gain)))
+    rows = []
+    for t, sd, earned in seen:
+        term, row = search.terms[t], search.rows[t][0]
+        occam = max(-np.log(sd * np.sqrt(2 * np.pi)), 0.0)
+        size = sd * np.sqrt(2 * (asked(len(selection.chosen.terms) + 1) + occam))
+        span = search.plan.coordinates.high[row] - search.plan.coordinates.low[row]
+        if size < 1 and not term.depends_on:
+            knob = term.knobs[0]
+            rows.append(
+                {"name": term.effect, "acts_on": term.acts_on, "parameter": knob.label,
+                 "smallest_detectable": float(size * span), "unit": knob.unit, "log_evidence_gain": earned}
+            )  # fmt: skip
+    return sorted(rows, key=lambda row: (row["name"], row["acts_on"]))
+
+
+def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measured: tuple[str, ...]) -> str:
+    """Return the verdict as one sentence with numbers and units."""
+    first, second = rmse(before.ahead), rmse(after.ahead)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = first / second
+    best = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else 0
+    steps = found["error"]["horizon_steps"]
+    goes = "falls" if second[best] < first[best] else "does not fall: it goes"
+    gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
+    if not np.isfinite(ratio).any():
+        gain = f"No test episode is more than {steps} rows long, so that errors as far ahead are not known (discovery.horizon)."
+    parts = [_phrase(e) for e in found["effects"]]
+    listed = " and ".join(parts)
+    rest = f" What is left depends on {dependence(found['remainder'])}." if found["remainder"] else ""
+    match found["verdict"]:
+        case "effect":
+            return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
+        case "ambiguous":
+            tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
+            names = " or ".join(_distinct(tied))
+            also = (
+                f" Besides: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
+                if len(parts) > 1
+                else ""
+            )
+            return f"Causes that fit these data equally well: {names}.{also} {gain}{rest}"
+        case "unexplained":
+            return f"The simulator lacks something without a name: {found['remainder']['description']}."
+        case _:
+            told = "Nothing is missing that these data could show: the calibrated simulator explains them"
+            if found["process_noise"]["share_after"] < SHAKEN:
+                return f"{told}."
+            return (
+                f"{told} but for what looks like white noise in the rates ({found['process_noise']['after']:.2g} per square "
+                "root of a second): disturbances, or something that changes faster than the rows can show."
+            )
+
+
+def _phrase(effect: dict[str, Any]) -> str:
+    values = ", ".join(
+        f"{name} = {p['value']:.3g} ({p['low']:.3g}..{p['high']:.3g}) {p['unit']}"
+        for name, p in effect["parameters"].items()
+    )
+    twin = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
+    also = f", which here is the same as {' and '.join(twin)}" if twin else ""
+    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}"
