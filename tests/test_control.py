@@ -15,20 +15,20 @@ import yaml
 from command_line import ROOT, simpel
 
 from simpel_cli.config.nodes import build
+from simpel_cli.control.agents.fine_tune import fading, fine_tuned, finite
+from simpel_cli.control.agents.planner import ICEM
+from simpel_cli.control.agents.policy import Actor, Policy
+from simpel_cli.control.agents.replay import Transitions, batches, empty, put
+from simpel_cli.control.agents.rollout import episodes, reflex
+from simpel_cli.control.agents.sac import SAC, Scaler
+from simpel_cli.control.plants.policy_files import contract, load_policy, save_policy
+from simpel_cli.control.plants.runner import PolicyRunner
+from simpel_cli.control.task import Judged, Task
+from simpel_cli.control.world import Situation, Step, World, beginning_at, learned_world, true_world
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.networks import MLP
-from simpel_cli.rl.files import contract, load_policy, save_policy
-from simpel_cli.rl.fine_tune import fading, fine_tuned, finite
-from simpel_cli.rl.planner import ICEM
-from simpel_cli.rl.policy import Actor, Policy
-from simpel_cli.rl.replay import Transitions, batches, empty, put
-from simpel_cli.rl.rollout import episodes, reflex
-from simpel_cli.rl.runner import PolicyRunner
-from simpel_cli.rl.sac import SAC, Scaler
-from simpel_cli.rl.task import Judged, Task
-from simpel_cli.rl.world import Situation, Step, World, beginning_at, learned_world, true_world
 from simulators.model import Quantity
 from simulators.worlds.rk4 import RK4
 

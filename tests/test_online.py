@@ -24,21 +24,21 @@ from simpel_cli.commands.fit import learned
 from simpel_cli.commands.study import settings_of
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import load
+from simpel_cli.control.agents.policy import Actor, Policy
+from simpel_cli.control.agents.rollout import episodes, reflex
+from simpel_cli.control.plants.environments import GymnasiumRig, WorldRig
+from simpel_cli.control.plants.exchange import Exchange
+from simpel_cli.control.plants.plant import Ride, Simulated, Stepped, earned, write_ride
+from simpel_cli.control.plants.policy_files import contract, load_policy, save_policy
+from simpel_cli.control.plants.returned_episodes import Answers
+from simpel_cli.control.plants.runner import PolicyRunner
+from simpel_cli.control.task import Task
+from simpel_cli.control.world import true_world
 from simpel_cli.data import Measurements, read
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.inference.networks import MLP
-from simpel_cli.rl.answers import Answers
-from simpel_cli.rl.exchange import Exchange
-from simpel_cli.rl.files import contract, load_policy, save_policy
-from simpel_cli.rl.plant import Ride, Simulated, Stepped, earned, write_ride
-from simpel_cli.rl.policy import Actor, Policy
-from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
-from simpel_cli.rl.rollout import episodes, reflex
-from simpel_cli.rl.runner import PolicyRunner
-from simpel_cli.rl.task import Task
-from simpel_cli.rl.world import true_world
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics
 from simpel_cli.runs.settings import stream
@@ -534,7 +534,7 @@ def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
     text = (ROOT / "conf" / "sim" / "pendulum.yaml").read_text().replace("phi", "angle").replace("omega", "speed")
     node = yaml.safe_load(text)
     lift = {
-        "_target_": "simpel_cli.rl.task.Task",
+        "_target_": "simpel_cli.control.task.Task",
         "reward": "cos(angle)",
         "initial": {"angle": [3, 3.2]},
         "horizon": 12,

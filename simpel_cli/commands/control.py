@@ -13,21 +13,21 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.commands.fit import Learned
 from simpel_cli.commands.study import source_of
 from simpel_cli.config.nodes import build
+from simpel_cli.control.agents.fine_tune import fine_tuned
+from simpel_cli.control.agents.planner import ICEM
+from simpel_cli.control.agents.policy import Policy
+from simpel_cli.control.agents.rollout import Episodes, episodes, reflex
+from simpel_cli.control.agents.sac import SAC, Rule
+from simpel_cli.control.compatibility import check_comparable
+from simpel_cli.control.settings import Control
+from simpel_cli.control.task import Goal, Task
+from simpel_cli.control.world import World, beginning_at, learned_world, true_world
 from simpel_cli.data.recording import Source
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference import loop
 from simpel_cli.inference.protocols import Problem
-from simpel_cli.rl.comparable import check_comparable
-from simpel_cli.rl.control import Control
-from simpel_cli.rl.fine_tune import fine_tuned
-from simpel_cli.rl.planner import ICEM
-from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import Episodes, episodes, reflex
-from simpel_cli.rl.sac import SAC, Rule
-from simpel_cli.rl.task import Goal, Task
-from simpel_cli.rl.world import World, beginning_at, learned_world, true_world
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.interruption import interruption, stop_if

@@ -19,17 +19,17 @@ from simpel_cli.commands.study import posteriors, resolved, settings_of, source_
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump, of_run
+from simpel_cli.control.online_settings import Online
+from simpel_cli.control.plants.environments import GymnasiumRig, WorldRig
+from simpel_cli.control.plants.exchange import Exchange
+from simpel_cli.control.plants.plant import Plant, Ride, Simulated, Stepped, write_ride
+from simpel_cli.control.plants.policy_files import load_policy
+from simpel_cli.control.plants.returned_episodes import Answers
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
 from simpel_cli.plots.canvas import columns_of
 from simpel_cli.plots.control import draw_online
 from simpel_cli.report import figure, write_report
-from simpel_cli.rl.answers import Answers
-from simpel_cli.rl.exchange import Exchange
-from simpel_cli.rl.files import load_policy
-from simpel_cli.rl.online import Online
-from simpel_cli.rl.plant import Plant, Ride, Simulated, Stepped, write_ride
-from simpel_cli.rl.rigs import GymnasiumRig, WorldRig
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
 from simpel_cli.runs.files import write_text

@@ -23,14 +23,14 @@ import optax
 import yaml
 
 from simpel_cli.config.nodes import build
+from simpel_cli.control.agents.fine_tune import fine_tuned
+from simpel_cli.control.agents.policy import Policy
+from simpel_cli.control.agents.rollout import Controller, episodes, reflex
+from simpel_cli.control.agents.sac import SAC, Rule
+from simpel_cli.control.settings import Control
+from simpel_cli.control.world import World, true_world
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.inference import loop
-from simpel_cli.rl.control import Control
-from simpel_cli.rl.fine_tune import fine_tuned
-from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import Controller, episodes, reflex
-from simpel_cli.rl.sac import SAC, Rule
-from simpel_cli.rl.world import World, true_world
 from simpel_cli.runs.settings import Settings, configure
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from simpel_cli.rl.sac import SAC
-from simpel_cli.rl.task import Judged
-from simpel_cli.rl.world import Situation, Step, World
+from simpel_cli.control.agents.sac import SAC
+from simpel_cli.control.task import Judged
+from simpel_cli.control.world import Situation, Step, World
 from simpel_cli.runs.settings import Settings, configure
 
 OBSERVATIONS, ACTIONS, UPDATES = 13, 2, 2000

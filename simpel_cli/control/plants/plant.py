@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.control.agents.policy import Policy
+from simpel_cli.control.agents.rollout import Episodes, episodes, reflex
+from simpel_cli.control.plants.policy_files import load_policy
+from simpel_cli.control.plants.runner import PolicyRunner
+from simpel_cli.control.task import Goal
+from simpel_cli.control.world import World
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import DataError
-from simpel_cli.rl.files import load_policy
-from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.rollout import Episodes, episodes, reflex
-from simpel_cli.rl.runner import PolicyRunner
-from simpel_cli.rl.task import Goal
-from simpel_cli.rl.world import World
 from simpel_cli.runs.files import write_table
 
 LEAST_ROWS = 2  # of an episode: one transition

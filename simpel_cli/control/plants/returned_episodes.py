@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.control.plants.plant import LEAST_ROWS, Ride, earned
+from simpel_cli.control.plants.runner import PolicyRunner
+from simpel_cli.control.task import Goal, Task
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import DataError
-from simpel_cli.rl.plant import LEAST_ROWS, Ride, earned
-from simpel_cli.rl.runner import PolicyRunner
-from simpel_cli.rl.task import Goal, Task
 from simpel_cli.runs.files import read_table
 from simulators.quantity import Quantity
 

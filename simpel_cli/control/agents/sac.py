@@ -18,12 +18,12 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from simpel_cli.control.agents import replay as memory
+from simpel_cli.control.agents.policy import Actor, Policy
+from simpel_cli.control.agents.replay import Replay, Transitions
+from simpel_cli.control.world import Situation, World
 from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference.networks import MLP
-from simpel_cli.rl import replay as memory
-from simpel_cli.rl.policy import Actor, Policy
-from simpel_cli.rl.replay import Replay, Transitions
-from simpel_cli.rl.world import Situation, World
 
 FLOAT32 = jnp.dtype("float32")
 LEAST_STD = 1e-3  # of an observation, in its unit: what never changes tells nothing

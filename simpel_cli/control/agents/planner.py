@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.control.agents.rollout import Controller, charged
+from simpel_cli.control.world import World
 from simpel_cli.errors import ConfigError, check_at_least_one
-from simpel_cli.rl.rollout import Controller, charged
-from simpel_cli.rl.world import World
 
 
 class Plan(NamedTuple):

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from simpel_cli.control.world import SAMPLING
 from simpel_cli.errors import ConfigError, check_at_least_one, did_you_mean
-from simpel_cli.rl.world import SAMPLING
 
 
 @dataclass(frozen=True)

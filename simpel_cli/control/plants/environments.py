@@ -7,10 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from simpel_cli.control.compatibility import check_comparable
+from simpel_cli.control.task import Goal
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.rl.comparable import check_comparable
-from simpel_cli.rl.task import Goal
 from simulators.worlds.world import World
 
 

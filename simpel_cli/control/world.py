@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from simpel_cli.control.task import Goal, Judged
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import OneStep
-from simpel_cli.rl.task import Goal, Judged
 
 Follow = Callable[[PRNGKeyArray, Float[Array, "B dx"]], Float[Array, "B dy"]]
 SAMPLING = ("ts1", "tsinf", "mean")

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from simpel_cli.control.plants.plant import Ride
+from simpel_cli.control.plants.returned_episodes import POLL, Answers
 from simpel_cli.errors import DataError
-from simpel_cli.rl.answers import POLL, Answers
-from simpel_cli.rl.plant import Ride
 from simpel_cli.runs.files import write_text
 
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.control.agents.policy import Actor, Policy
+from simpel_cli.control.agents.rollout import episodes, reflex
+from simpel_cli.control.world import Situation, Step, World
 from simpel_cli.inference.networks import Layers
-from simpel_cli.rl.policy import Actor, Policy
-from simpel_cli.rl.rollout import episodes, reflex
-from simpel_cli.rl.world import Situation, Step, World
 
 Carry = tuple[Layers, Any, Float[Array, ""], Layers]  # layers, optimiser, least loss so far and its layers
 CLIP = 1.0  # of the gradient's norm: through a contact or a spin it is of any size

@@ -8,11 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from simpel_cli.control.agents.policy import Policy
+from simpel_cli.control.plants import runner
+from simpel_cli.control.task import Goal
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.rl import runner
-from simpel_cli.rl.policy import Policy
-from simpel_cli.rl.task import Goal
 from simpel_cli.runs.arrays import read_arrays, write_arrays
 from simpel_cli.runs.files import write_text
 

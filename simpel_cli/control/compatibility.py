@@ -2,9 +2,9 @@
 
 import math
 
+from simpel_cli.control.task import Goal
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
-from simpel_cli.rl.task import Goal
 from simulators.model import Model
 from simulators.worlds.world import World
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from simpel_cli.rl.world import World
+from simpel_cli.control.world import World
 
 
 class Episodes(NamedTuple):

@@ -1,0 +1,1 @@
+"""Who acts: soft actor-critic, gradient fine-tuning, planning; and roll-outs of any controller."""

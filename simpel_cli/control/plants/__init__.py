@@ -1,0 +1,1 @@
+"""What a policy drives: simulators, environments that are stepped, a rig behind a folder; and the files it takes along."""
