@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from simpel_cli.data.computed import with_computed
-from simpel_cli.data.table import Table, read_table
+from simpel_cli.data.tables.table import Table, read_table
 from simpel_cli.errors import ConfigError, DataError
 
 

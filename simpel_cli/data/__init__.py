@@ -1,10 +1,10 @@
 """Measurements: read, checked, cut into episodes, brought to the simulator's dt and split."""
 
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.files import absolute
 from simpel_cli.data.reader import read
 from simpel_cli.data.recording import Check, Episode, Recording, Transitions, no_transitions, select, transitions
 from simpel_cli.data.segments import Places, origins, places
+from simpel_cli.data.tables.locate import absolute
 
 __all__ = [
     "Check", "Episode", "Measurements", "Places", "Recording", "Transitions", "absolute", "no_transitions", "origins",

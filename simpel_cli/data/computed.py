@@ -6,7 +6,7 @@ from dataclasses import replace
 import casadi
 import numpy as np
 
-from simpel_cli.data.table import Table
+from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import ConfigError
 from simulators.expression import ExpressionError, parse, symbols_used
 

@@ -5,19 +5,19 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.data import checks, sensor_checks
+from simpel_cli.data.checks import clock, gaps, sensors, values
+from simpel_cli.data.checks.noise import third_difference_std
+from simpel_cli.data.checks.units import check_units, period
 from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.files import by_file, locate
-from simpel_cli.data.kinematics import Motion, derived, differences, kinematics
-from simpel_cli.data.noise import third_difference_std
+from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
+from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
-from simpel_cli.data.smoother import estimate_speeds, speeds
 from simpel_cli.data.split import PARTS, assign
-from simpel_cli.data.table import read_table
-from simpel_cli.data.units import check_units, period
+from simpel_cli.data.tables.locate import by_file, locate
+from simpel_cli.data.tables.table import read_table
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
 
@@ -54,16 +54,16 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     report = [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
-    finite, rows = checks.finite(rows, measured, _column_names(config, model, mapping))
+    finite, rows = values.finite(rows, measured, _column_names(config, model, mapping))
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
-    report += [check(rows, model, mapping.outputs) for check in (checks.constant, checks.ranges)]
+    report += [check(rows, model, mapping.outputs) for check in (values.constant, values.ranges)]
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
         computed: tuple[str, ...] = config.derived
     else:
-        report.append(checks.monotonic(rows, table, config))
+        report.append(clock.monotonic(rows, table, config))
         parts, noise, more, computed = _trajectories(config, model, rows, mapping, whole)
         report += more
     for part, episodes in parts.items():
@@ -85,11 +85,11 @@ def _trajectories(
     config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
     """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
-    sampling, raw = checks.sampling(rows, model, config)
-    gaps, starts = checks.gaps(rows, raw, config)
+    sampling, raw = clock.sampling(rows, model, config)
+    cut, starts = gaps.gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
     faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
-    report = [sampling, gaps, *faults]
+    report = [sampling, cut, *faults]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
     if mapping.unmeasured:
@@ -129,9 +129,9 @@ def _sensors(
         if p in columns and v in columns
     ]
     found = [
-        sensor_checks.jitter(times, dt, model.dt if config.resample is None else None),
-        sensor_checks.stale(columns),
-        sensor_checks.quantisation(columns, units),
+        sensors.jitter(times, dt, model.dt if config.resample is None else None),
+        sensors.stale(columns),
+        sensors.quantisation(columns, units),
         kinematics(motions),
         derived(motions, config.derived),
     ]
@@ -221,7 +221,7 @@ def _noise_check(config: Measurements, model: Source, noise: dict[str, float]) -
 
 
 def _column_names(config: Measurements, model: Source, mapping: Mapping) -> tuple[str, ...]:
-    """Columns behind `checks.finite`, in its order."""
+    """Columns behind `values.finite`, in its order."""
     states = [mapping.columns[q.name] for q in model.states if q.name in mapping.columns]
     inputs = [mapping.columns[q.name] for q in model.inputs]
     outputs = [mapping.columns[name] for name in mapping.outputs]

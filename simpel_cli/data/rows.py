@@ -6,7 +6,7 @@ import numpy as np
 
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Source
-from simpel_cli.data.table import Table
+from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import DataError
 
 
@@ -171,3 +171,13 @@ def _following(table: Table, mapping: Mapping, name: str) -> np.ndarray:
 
 def _stack(n: int, columns: list[np.ndarray]) -> np.ndarray:
     return np.stack(columns, axis=1) if columns else np.empty((n, 0))
+
+
+def same_episode(rows: Rows) -> np.ndarray:
+    """Mask (n-1,): row i+1 is of the same episode."""
+    return rows.episode[1:] == rows.episode[:-1]
+
+
+def follows(rows: Rows) -> np.ndarray:
+    """Mask (n-1,): row i+1 is the next row of the same episode, none was dropped between."""
+    return same_episode(rows) & (np.diff(rows.position) == 1)

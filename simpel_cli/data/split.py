@@ -5,7 +5,7 @@ import numpy as np
 from simpel_cli.data.config import SPLIT_DEFAULT, Measurements
 from simpel_cli.data.recording import Check, stream
 from simpel_cli.data.rows import Rows, split_labels
-from simpel_cli.data.table import Table
+from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import DataError
 
 PARTS = ("train", "test")

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from systems import model
 
 from simpel_cli.data import Measurements, read
-from simpel_cli.data.hidden import Drive, drive, solve
+from simpel_cli.data.estimation.hidden_states import Drive, drive, solve
 from simpel_cli.errors import DataError
 from simulators.model import Declared, Model
 

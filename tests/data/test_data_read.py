@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from simpel_cli.data import Measurements, Recording, read, transitions
-from simpel_cli.data.sheet import read_sheet
+from simpel_cli.data.tables.sheet import read_sheet
 from simpel_cli.errors import ConfigError, DataError, SimpelError
 from simulators.model import Declared, Model
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.interpolate import make_smoothing_spline
 
 from simpel_cli.data import Measurements, read
+from simpel_cli.data.estimation.smoother import choose_smoothing, estimate_speeds, slope_noise, speeds
 from simpel_cli.data.recording import Episode
-from simpel_cli.data.smoother import choose_smoothing, estimate_speeds, slope_noise, speeds
 from simpel_cli.errors import DataError
 from simulators.model import Declared, Model
 from simulators.worlds.callable_world import CallableWorld

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from test_sensor_checks import check, measured, motion
 
-from simpel_cli.data.kinematics import Motion, agreement, derived, difference_kind, differences, is_filtered, kinematics
+from simpel_cli.data.estimation.kinematics import (
+    Motion,
+    agreement,
+    derived,
+    difference_kind,
+    differences,
+    is_filtered,
+    kinematics,
+)
 
 RNG = np.random.default_rng(0)
 

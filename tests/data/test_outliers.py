@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from simpel_cli.data.outliers import lone_values
+from simpel_cli.data.checks.outliers import lone_values
 
 DT, ROWS, EPISODES = 0.05, 100, 5
 Rate = Callable[[np.ndarray, float], list[float]]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data import Check, Measurements, Recording, read
-from simpel_cli.data.kinematics import Motion, derived, kinematics
-from simpel_cli.data.sensor_checks import held, jitter, quantisation, quantum, stale
+from simpel_cli.data.checks.sensors import held, jitter, quantisation, quantum, stale
+from simpel_cli.data.estimation.kinematics import Motion, derived, kinematics
 from simulators.model import Declared
 
 SWING = Declared(

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.data.noise import MIN_ROWS
-from simpel_cli.data.outliers import lone_values
+from simpel_cli.data.checks.noise import MIN_ROWS
+from simpel_cli.data.checks.outliers import lone_values
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.errors import DataError
 from simulators.model import Model

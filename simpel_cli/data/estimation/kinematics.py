@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.data.noise import third_difference_std
+from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.data.recording import Check
 
 TOLERANCE = 0.05  # of the scale, and of the velocity's standard deviation for an offset

@@ -1,25 +1,19 @@
-"""What can be wrong with rows: each check reports, and drops, cuts or refuses where it must."""
+"""Values of measured columns: finite, varying, within the declared ranges."""
 
 import math
 
 import numpy as np
 
-from simpel_cli.data.config import Measurements
+from simpel_cli.data.checks.units import period
+from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.data.recording import Check, Source
-from simpel_cli.data.rows import Rows
-from simpel_cli.data.sensor_checks import IRREGULAR_SHARE, irregular_share
-from simpel_cli.data.smoother import speeds
-from simpel_cli.data.table import Table
-from simpel_cli.data.units import period
-from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.data.rows import Rows, follows
+from simpel_cli.errors import DataError
 from simulators.model import Quantity
 
-DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
-MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
 MOSTLY = 0.5  # of the values outside a range: it is the unit, not the motion
 SPIKE = 10.0  # widths of a range beyond it
 DEGREES = 361.0  # no angle in degrees within one turn reads more
-MANY_GAPS = 0.01  # of the steps; more are a clock that is irregular
 LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
 
 
@@ -61,99 +55,6 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
     detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or nothing in {where}); episodes are cut there{note}"
     return Check("finite", False, detail), rows.take(keep)
-
-
-def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
-    """Refuse time that stands still or runs backwards within an episode.
-
-    Raises:
-        DataError: names row, episode and the two times.
-    """
-    back = (np.diff(rows.time) <= 0) & _same_episode(rows)
-    if back.any():
-        i = int(np.flatnonzero(back)[0])
-        fault = "stands still" if rows.time[i + 1] == rows.time[i] else "runs backwards"
-        cure = "Sort the file or remove repeated rows."
-        if config.episode is None:
-            cure += " If the file holds several episodes, name their column: data.episode."
-        raise DataError(
-            f"time {fault} at {table.place(int(rows.number[i + 1]))}, episode {rows.episode[i]}: "
-            f"{rows.time[i]:.6g} s, then {rows.time[i + 1]:.6g} s. {cure}"
-        )
-    return Check("time", True, "increasing")
-
-
-def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, float]:
-    """Compare the distance of the rows with the simulator's dt.
-
-    Returns:
-        The check, and the dt of the data, s (median).
-
-    Raises:
-        ConfigError: data.resample is not the simulator's dt.
-        DataError: too few rows, or a dt that is not the simulator's.
-    """
-    if config.resample is not None and not math.isclose(config.resample, model.dt, rel_tol=1e-3):
-        raise ConfigError(
-            f"data.resample: {config.resample:g} s is not the dt of simulator '{model.name}'. "
-            f"Set data.resample: {model.dt:g}, or sim.dt: {config.resample:g}."
-        )
-    steps = np.diff(rows.time)[_follows(rows)]
-    if len(steps) == 0 and not model.states and config.resample is None:
-        return Check("sampling", True, "every row is an episode of its own"), model.dt
-    if len(steps) == 0:
-        raise DataError(f"too few rows: none of {len(rows.time)} rows follows another in the same episode.")
-    dt = float(np.median(steps))
-    in_ms = " The time looks like ms: it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
-    if config.resample is not None and dt > MAX_UPSAMPLING * model.dt:
-        raise DataError(
-            f"the rows are {dt:.4g} s apart: resampling to {model.dt:g} s would invent most rows.{in_ms} "
-            f"Record faster, or set sim.dt: {dt:.4g} and data.resample: null."
-        )
-    if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
-        bridge, why = "", ""
-        if irregular_share(steps, dt) > IRREGULAR_SHARE:
-            bridge = _bridge(steps, 1.5 * max(dt, model.dt), " and ")
-            why = " (in the middle; they are irregular)"
-        raise DataError(
-            f"the rows are {dt:.4g} s apart{why}, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
-            f"Bring the data to it with data.resample: {model.dt:g}{bridge}, or set sim.dt: {dt:.4g}."
-        )
-    return Check("sampling", True, f"dt {dt:.4g} s"), dt
-
-
-def gaps(rows: Rows, dt: float, config: Measurements) -> tuple[Check, np.ndarray]:
-    """Find where a segment of contiguous rows starts.
-
-    Args:
-        rows: checked for NaN.
-        dt: of the data, s.
-        config: `max_gap`, s; null = 1.5 steps, of the data or of what they are resampled to.
-
-    Returns:
-        The check, and a mask (n,): True at the first row of every segment (new episode, new split, dropped row, gap).
-    """
-    limit = 1.5 * max(dt, config.resample or 0.0) if config.max_gap is None else config.max_gap
-    steps = np.diff(rows.time)
-    gap = _follows(rows) & (steps > limit)
-    starts = np.concatenate([[True], ~_follows(rows) | gap | (rows.split[1:] != rows.split[:-1])])
-    if not gap.any():
-        return Check("gaps", True, f"no step longer than {limit:.3g} s"), starts
-    shown = [f"episode {rows.episode[i]} at {rows.time[i]:.4g} s ({steps[i]:.3g} s)" for i in np.flatnonzero(gap)[:3]]
-    more = ", ..." if gap.sum() > len(shown) else ""
-    detail = f"{int(gap.sum())} gaps longer than {limit:.3g} s, cut there: {', '.join(shown)}{more}"
-    if config.resample is not None and gap.sum() > MANY_GAPS * np.sum(_follows(rows)):
-        detail += f". Wider ones are bridged with {_bridge(steps[_follows(rows)], limit, '')}"
-    return Check("gaps", False, detail), starts
-
-
-def _bridge(steps: np.ndarray, limit: float, before: str) -> str:
-    """Say which data.max_gap passes over 99 % of the steps; nothing if they are no longer than the limit anyway."""
-    longest = float(np.percentile(steps, 99))
-    if longest <= limit:
-        return ""
-    digit = 10.0 ** (math.floor(math.log10(longest)) - 1)
-    return f"{before}data.max_gap: {math.ceil(longest / digit) * digit:.4g}"
 
 
 def constant(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
@@ -206,13 +107,13 @@ def _farthest(values: np.ndarray, quantity: Quantity) -> float | None:
 
 def _too_fast(rows: Rows, values: np.ndarray, angle: Quantity, model: Source) -> bool:
     """Whether an angle lies mostly outside its range, and turns faster than its speed's range, or than can be seen."""
-    if np.mean((values < angle.low) | (values > angle.high)) <= MOSTLY or not _follows(rows).any():
+    if np.mean((values < angle.low) | (values > angle.high)) <= MOSTLY or not follows(rows).any():
         return False
-    turned = np.abs(np.diff(values))[_follows(rows)]
+    turned = np.abs(np.diff(values))[follows(rows)]
     ranges = {q.name: max(abs(q.low), abs(q.high)) for q in model.states}
     limits = [ranges[speed] for speed, angles in speeds(model).items() if angle.name in angles]
     if limits:
-        return bool(np.median(turned / np.diff(rows.time)[_follows(rows)]) > min(limits))
+        return bool(np.median(turned / np.diff(rows.time)[follows(rows)]) > min(limits))
     return bool(np.max(np.abs(values)) <= DEGREES and np.ptp(values) > 4 * math.pi)
 
 
@@ -232,12 +133,3 @@ def _named(rows: Rows, model: Source, outputs: tuple[str, ...]) -> dict[str, np.
     measured = {name: column for name, column in states.items() if not np.isnan(column).all()}
     inputs = {q.name: column for q, column in zip(model.inputs, rows.inputs.T, strict=True)}
     return measured | inputs | dict(zip(outputs, rows.outputs.T, strict=True))
-
-
-def _same_episode(rows: Rows) -> np.ndarray:
-    return rows.episode[1:] == rows.episode[:-1]
-
-
-def _follows(rows: Rows) -> np.ndarray:
-    """Mask (n-1,): row i+1 is the next row of the same episode, none was dropped between."""
-    return _same_episode(rows) & (np.diff(rows.position) == 1)

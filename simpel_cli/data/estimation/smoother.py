@@ -18,7 +18,7 @@ from typing import NamedTuple
 import casadi
 import numpy as np
 
-from simpel_cli.data.hidden import Drive, drive, solve
+from simpel_cli.data.estimation.hidden_states import Drive, drive, solve
 from simpel_cli.data.recording import Check, Episode, Source
 from simpel_cli.errors import DataError
 from simulators.model import Model

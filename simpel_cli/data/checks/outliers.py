@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simpel_cli.data.sensor_checks import quantum
+from simpel_cli.data.checks.sensors import quantum
 
 FAR = 6.0  # usual deviations
 ROBUST = 1.4826  # standard deviation of a normal distribution over its median absolute deviation

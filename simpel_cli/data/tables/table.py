@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.data.sheet import Sheet, read_sheet
+from simpel_cli.data.tables.sheet import Sheet, read_sheet
 from simpel_cli.errors import DataError, did_you_mean
 
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import parquet
 
-from simpel_cli.data.csv_file import BLANKS, Dialect, line_of, read_csv
+from simpel_cli.data.tables.csv_file import BLANKS, Dialect, line_of, read_csv
 from simpel_cli.errors import DataError
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")

@@ -8,7 +8,7 @@ import yaml
 
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Check
-from simpel_cli.data.table import Table
+from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
 

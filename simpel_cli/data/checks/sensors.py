@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from simpel_cli.data.noise import third_difference_std
+from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.data.recording import Check
 
 STALE_SHARE = 0.05  # of the rows; fewer repeats are what a quantised sensor gives

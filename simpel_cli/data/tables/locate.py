@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.table import Table
+from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 
 BY_FILE = "data.split.test_files"  # column that `by_file` adds to a table

@@ -1,0 +1,1 @@
+"""States that were not measured: speeds, and levels behind them, from what was measured."""
