@@ -10,12 +10,12 @@ import yaml
 from command_line import ROOT, simpel
 from omegaconf import OmegaConf
 
-from simpel_cli.commands.study import Evaluation
 from simpel_cli.config.nodes import build
 from simpel_cli.config.overrides import checked, count_jobs
 from simpel_cli.config.places import conf_dir
 from simpel_cli.data import Measurements
 from simpel_cli.runs.settings import Settings
+from simpel_cli.studies.study import Evaluation
 from simulators.built import Built
 from simulators.model import Model
 from simulators.worlds.simulate import Simulate

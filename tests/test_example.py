@@ -63,7 +63,7 @@ def test_launcher_of_its_own(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_friction_is_found(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simpel_cli.commands.close.SIZES", (20, 10**6))  # there are not as many
+    monkeypatch.setattr("simpel_cli.studies.close_loop.SIZES", (20, 10**6))  # there are not as many
     small = [word for word in TINY if word.startswith("method.")]
     result = simpel(my, "discover", "--config-dir", ".", "experiment=cart", *small, "hydra.run.dir=found")
     assert result.code == 0, result.err

@@ -136,7 +136,7 @@ print(json.dumps({"mean": now.mean, "std": now.std, "course": course.tolist()}))
 
 def test_numpy_predicts_what_the_posterior_does(fitted: Path, tmp_path: Path) -> None:
     from simpel_cli.commands.fit import checkpointed_state
-    from simpel_cli.commands.study import open_study, posteriors, prepare
+    from simpel_cli.studies.study import open_study, posteriors, prepare
 
     assert simpel(tmp_path, "export", fitted, "--out", "out", "--seed", "1").code == 0
     shown = subprocess.run(

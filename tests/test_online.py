@@ -21,7 +21,6 @@ from command_line import ROOT, simpel
 
 from simpel_cli.commands.control import assignment, world_of_posterior
 from simpel_cli.commands.fit import learned
-from simpel_cli.commands.study import settings_of
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import load
 from simpel_cli.control.agents.policy import Actor, Policy
@@ -42,6 +41,7 @@ from simpel_cli.inference.networks import MLP
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics
 from simpel_cli.runs.settings import stream
+from simpel_cli.studies.study import settings_of
 
 HORIZON = 12
 FLOAT32 = jnp.dtype("float32")

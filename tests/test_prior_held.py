@@ -8,10 +8,10 @@ import pytest
 from command_line import simpel
 
 from simpel_cli.commands.fit import learned
-from simpel_cli.commands.study import posteriors
 from simpel_cli.config.resolved import load
 from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays as arrays_of
+from simpel_cli.studies.study import posteriors
 
 
 @pytest.mark.slow

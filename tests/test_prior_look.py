@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from simpel_cli.commands.prior_look import describe_prior
 from simpel_cli.inference.prior_predictive import OutputCheck, PriorCheck
+from simpel_cli.reporting.prior_check import describe_prior
 from simpel_cli.runs.console import Terminal
 
 FINE = OutputCheck("s", "m", 0, 20, 1.1, 0.4, 0.9, 0.6)

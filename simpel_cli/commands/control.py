@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.commands.fit import Learned
-from simpel_cli.commands.study import source_of
 from simpel_cli.config.nodes import build
 from simpel_cli.control.agents.fine_tune import fine_tuned
 from simpel_cli.control.agents.planner import ICEM
@@ -33,6 +32,7 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.settings import Settings, stream
+from simpel_cli.studies.study import source_of
 from simulators.model import Model
 
 Judge = Callable[[Policy, PRNGKeyArray], Episodes]  # leaves of the policy (runs, ...)

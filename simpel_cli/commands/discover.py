@@ -10,9 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from simpel_cli.commands.close import close, memory_of
 from simpel_cli.commands.discover_show import publish
-from simpel_cli.commands.study import open_study, refuse_untested, resolved, settings_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump
@@ -43,6 +41,8 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import strict, write_table, write_text
 from simpel_cli.runs.manifest import Manifest
+from simpel_cli.studies.close_loop import close, memory_of
+from simpel_cli.studies.study import open_study, refuse_untested, resolved, settings_of
 from simulators.effects import Expression, Term
 from simulators.model import Model
 

@@ -5,10 +5,8 @@ from typing import Any
 
 from simpel_cli.commands.extent import extent_of_test
 from simpel_cli.commands.fit import checkpointed_state, refuse_changed_inputs
-from simpel_cli.commands.judge import judge
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe_data, publish
-from simpel_cli.commands.study import Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.data import Check
@@ -18,6 +16,8 @@ from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_text
 from simpel_cli.runs.manifest import Manifest, read_manifest, sha256
 from simpel_cli.runs.metrics import write_metrics
+from simpel_cli.studies.judgement import judge
+from simpel_cli.studies.study import Study, open_study, posteriors, prepare, resolved, settings_of
 
 CARDS = (".yaml",)  # describe columns; one may lie beside several files
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit

@@ -7,11 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from simpel_cli.commands.judge import Judged, judge
-from simpel_cli.commands.prior_look import look_at_prior
 from simpel_cli.commands.run_table import run_table
 from simpel_cli.commands.show import describe, publish
-from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
@@ -23,6 +20,9 @@ from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config, sha256
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.tensorboard import Scalars
+from simpel_cli.studies.judgement import Judged, judge
+from simpel_cli.studies.prior_check import prior_check
+from simpel_cli.studies.study import STRETCH, Fitted, Study, open_study, posteriors, prepare, resolved, settings_of
 
 LOG_EVERY = 50  # steps per row of the metric table
 DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
@@ -95,7 +95,7 @@ def _run(
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet or not shown, directory / "run.log")
     fitted = prepare(study)
-    checked = look_at_prior(study, fitted)
+    checked = prior_check(study, fitted)
     describe(terminal, study, fitted, checked)
     if checked is not None:
         write_table(directory / "prior_predictive.parquet", checked.table)

@@ -120,7 +120,7 @@ def _runner(verb: str, resumed: bool) -> Callable[[Any], None]:
 
 def _changed(job: Job) -> str:
     """Return what the configuration in the directory has otherwise than the job; empty: nothing that changes a result."""
-    from simpel_cli.commands.study import resolved
+    from simpel_cli.studies.study import resolved
 
     own = {"quiet", "cache", "device"}
     if job.verb == "discover":

@@ -18,7 +18,6 @@ from simpel_cli.commands.control import (
     train,
 )
 from simpel_cli.commands.fit import Learned, learned
-from simpel_cli.commands.study import open_study, resolved, settings_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.control.agents.rollout import Episodes
@@ -36,6 +35,7 @@ from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_con
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.settings import configure, stream
 from simpel_cli.runs.tensorboard import Scalars
+from simpel_cli.studies.study import open_study, resolved, settings_of
 
 OWN = (
     "policy",

@@ -15,7 +15,6 @@ from simpel_cli import evaluation as ev
 from simpel_cli.commands.control import Assignment, Flown, assignment, remarks, task_table, train
 from simpel_cli.commands.fit import Learned, learned
 from simpel_cli.commands.rl_offline import OWN, done_steps, saved_policies
-from simpel_cli.commands.study import posteriors, resolved, settings_of, source_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump, of_run
@@ -38,6 +37,7 @@ from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_con
 from simpel_cli.runs.metrics import MetricStream, write_metrics
 from simpel_cli.runs.settings import Settings, configure, stream
 from simpel_cli.runs.tensorboard import Scalars
+from simpel_cli.studies.study import posteriors, resolved, settings_of, source_of
 from simulators.model import Model
 
 WORLDS = "sim, mujoco, gymnasium:ID and folder:DIR"

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.judge import Judged
-from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.runs.manifest import Manifest, versions
+from simpel_cli.studies.judgement import Judged
+from simpel_cli.studies.study import Fitted, Study
 
 PHASES = (("compilation", "compile_seconds"), ("training", "train_seconds"))
 

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.commands.extent import extent_of_split, extent_of_test
-from simpel_cli.commands.judge import Judged
-from simpel_cli.commands.prior_look import describe_prior
 from simpel_cli.commands.run_table import named_method
-from simpel_cli.commands.study import Fitted, Study
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.inference.prior_predictive import PriorCheck
 from simpel_cli.inference.protocols import Method
 from simpel_cli.plots import draw_run
 from simpel_cli.report import figure, write_report
+from simpel_cli.reporting.prior_check import describe_prior
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed
+from simpel_cli.studies.judgement import Judged
+from simpel_cli.studies.study import Fitted, Study
 
 METRICS = {
     "nll": "NLL",

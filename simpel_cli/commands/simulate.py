@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from simpel_cli.commands.study import settings_of, source_of
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump
@@ -11,6 +10,7 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import Manifest
+from simpel_cli.studies.study import settings_of, source_of
 from simulators.worlds.simulate import Simulate
 
 

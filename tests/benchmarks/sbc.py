@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.commands.study import STRETCH, Fitted, Study, open_study, prepare, resolved
 from simpel_cli.config.launch import Job, launch
 from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays
@@ -26,6 +25,7 @@ from simpel_cli.inference.assemble import assemble
 from simpel_cli.plots.canvas import COLOURS, new_figure, save
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.settings import stream
+from simpel_cli.studies.study import STRETCH, Fitted, Study, open_study, prepare, resolved
 
 MOST_TESTED = 64  # inputs at which the posterior is looked at
 

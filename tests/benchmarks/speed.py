@@ -72,9 +72,9 @@ def measured(given: dict[str, Any], stretches: int, started: float) -> dict[str,
         started: when the process began, seconds of the epoch.
     """
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    from simpel_cli.commands.study import STRETCH
     from simpel_cli.inference import loop
     from simpel_cli.runs.settings import Settings, configure
+    from simpel_cli.studies.study import STRETCH
     from tests.benchmarks.arrays import case
 
     configure(Settings())

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from simpel_cli.commands.study import STRETCH
 from simpel_cli.config.nodes import build
 from simpel_cli.config.places import conf_dir
 from simpel_cli.inference import loop
@@ -21,6 +20,7 @@ from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.settings import Settings, configure, stream
+from simpel_cli.studies.study import STRETCH
 
 SEEDS = 5
 DRAWS = 256

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.judge import judge
-from simpel_cli.commands.study import STRETCH, open_study, posteriors, prepare
 from simpel_cli.config.nodes import build
 from simpel_cli.data import transitions
 from simpel_cli.inference import loop
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.metrics import write_metrics
+from simpel_cli.studies.judgement import judge
+from simpel_cli.studies.study import STRETCH, open_study, posteriors, prepare
 
 SIZES = (20, 50)  # training transitions
 SEEDS = 5

@@ -1,0 +1,21 @@
+"""Whether the simulator with its ranges can explain the training data, before networks are trained."""
+
+import jax
+import numpy as np
+
+from simpel_cli.inference.prior_predictive import PriorCheck, check_prior
+from simpel_cli.runs.settings import stream
+from simpel_cli.studies.study import Fitted, Study
+
+
+def prior_check(study: Study, fitted: Fitted) -> PriorCheck | None:
+    """Compare the training targets of the first seed with draws of the prior; None where there is nothing to compare."""
+    if not study.prior.uses_simulator or len(fitted.training[0][0]) == 0:
+        return None
+    problem = jax.tree.map(lambda a: np.asarray(a[0]), fitted.assembled.problems)
+    x, y = fitted.training[0]
+    gap_scale = None if study.prior.gap is None else problem.gap_scale
+    return check_prior(
+        study.system, fitted.assembled.setting, fitted.normaliser, x, y, study.recording.noise_std, gap_scale,
+        stream(0, "prior_predictive"), problem.bank,
+    )  # fmt: skip
