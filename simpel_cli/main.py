@@ -255,8 +255,8 @@ def report(
 
       simpel report runs/fit/pendulum/* --baseline fsvgd --out comparison
     """
-    from simpel_cli.commands.report import default_folder
-    from simpel_cli.commands.report import report as task
+    from simpel_cli.reporting.compare_runs import default_folder
+    from simpel_cli.reporting.compare_runs import report as task
 
     task(directories, out or default_folder(directories), baseline)
 
@@ -287,7 +287,7 @@ def sims(
     config_dir: ConfigDir = None,
 ) -> None:
     """List the simulators with their units."""
-    from simpel_cli.commands.catalogue import sims as task
+    from simpel_cli.reporting.catalogue import sims as task
 
     task(name, config_dir)
 
@@ -300,7 +300,7 @@ def effects(
     config_dir: ConfigDir = None,
 ) -> None:
     """List the effects that `discover` can find, with their formulas."""
-    from simpel_cli.commands.catalogue import effects as task
+    from simpel_cli.reporting.catalogue import effects as task
 
     task(name, config_dir)
 
@@ -322,7 +322,7 @@ def example(
 @app.command()
 def doctor() -> None:
     """Tell what this installation has, and test in a few seconds whether it computes right."""
-    from simpel_cli.commands.doctor import doctor as task
+    from simpel_cli.reporting.doctor import doctor as task
 
     task()
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from command_line import CART, rig, simpel
 
-from simpel_cli.commands import doctor
 from simpel_cli.config.places import conf_dir
+from simpel_cli.reporting import doctor
 
 
 def test_every_simulator_is_listed_and_can_be_shown(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 import searches
 
-from simpel_cli.commands.discover_report import equation_section, marked, next_section, prior_section, untested
-from simpel_cli.commands.discover_show import next_commands, publish
-from simpel_cli.plots import discover_evidence, discover_force, discover_next, discover_runs, draw_discover
-from simpel_cli.plots.canvas import columns_of, units_of, with_interval
+from simpel_cli.reporting.discover import next_commands, publish
+from simpel_cli.reporting.discover_sections import equation_section, marked, next_section, prior_section, untested
+from simpel_cli.reporting.figures import discover_evidence, discover_force, discover_next, discover_runs, draw_discover
+from simpel_cli.reporting.figures.canvas import columns_of, units_of, with_interval
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import write_table
 

@@ -10,7 +10,6 @@ import oracles
 import pytest
 from test_methods import EDGE, FIXED, GRID, NOISE, PARAMS, X, predicted, prior_of, problem_of, run, setting_of
 
-from simpel_cli.commands.show import used
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.networks import MLP
 from simpel_cli.inference.noise import NoiseModel
@@ -19,6 +18,7 @@ from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.priors.function_prior import FunctionPrior
 from simpel_cli.priors.gaussian_process import SquaredExponential
 from simpel_cli.priors.marginal_likelihood import evenly
+from simpel_cli.reporting.fit import used
 
 KAPPA, LENGTH = 0.5, 1.0
 FEW: dict[str, Any] = {"network": MLP((2,)), "batch": 4, "pool": 32, "features": 500}

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from simpel_cli.plots import run
+from simpel_cli.reporting.figures import run
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics, write_metrics
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from simpel_cli.plots.control import draw_control
-from simpel_cli.report import figure, write_report
+from simpel_cli.reporting.figures.control import draw_control
+from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import write_metrics
 

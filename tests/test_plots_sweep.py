@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simpel_cli.plots import draw_sweep, sweep
+from simpel_cli.reporting.figures import draw_sweep, sweep
 from simpel_cli.runs.metrics import write_metrics
 
 SIZES = (10, 20)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from simpel_cli.config.overrides import swept_keys
 from simpel_cli.errors import ConfigError, SimpelError
-from simpel_cli.plots import draw_sweep
+from simpel_cli.reporting.figures import draw_sweep
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import typed
 from simpel_cli.runs.files import write_text

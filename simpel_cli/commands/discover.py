@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from simpel_cli.commands.discover_show import publish
 from simpel_cli.config.launch import Job
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import dump
@@ -37,6 +36,7 @@ from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, unseen
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.errors import ConfigError, Inconclusive
+from simpel_cli.reporting.discover import publish
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import strict, write_table, write_text

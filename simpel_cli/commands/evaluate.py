@@ -3,14 +3,14 @@
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.commands.extent import extent_of_test
 from simpel_cli.commands.fit import checkpointed_state, refuse_changed_inputs
-from simpel_cli.commands.run_table import run_table
-from simpel_cli.commands.show import describe_data, publish
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.data import Check
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
+from simpel_cli.reporting.data_summary import test_summary
+from simpel_cli.reporting.fit import describe_data, publish
+from simpel_cli.reporting.run_table import run_table
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_text
@@ -62,8 +62,12 @@ def evaluate(job: Job) -> None:
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")
         terminal.line(f"simpel evaluate · {run} · step {step}", style="bold")
-        extent = extent_of_test(judged_on.recording)
-        what = f"the test split of the fit, {extent}" if judged_on is study else f"all of it, {extent}, new to the fit"
+        judged_rows = test_summary(judged_on.recording)
+        what = (
+            f"the test split of the fit, {judged_rows}"
+            if judged_on is study
+            else f"all of it, {judged_rows}, new to the fit"
+        )
         describe_data(terminal, judged_on.recording, what)
         judged = judge(judged_on, posteriors(study, fitted, state), fitted.target_std, directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate"}
@@ -91,7 +95,7 @@ def _new_measurements(
     if any(sha256(file) in known for file in recording.files if file.suffix not in CARDS):
         return study  # another split of the run's own file would judge the model on what it was trained on
     recording = recording._replace(train=(), test=(*recording.train, *recording.test))
-    said = f"everything is judged ({extent_of_test(recording)}): the fit was not trained on this file"
+    said = f"everything is judged ({test_summary(recording)}): the fit was not trained on this file"
     checks = tuple(Check("split", True, said) if check.name == "split" else check for check in recording.checks)
     return other._replace(recording=recording._replace(checks=checks))
 

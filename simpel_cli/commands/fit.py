@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from simpel_cli.commands.run_table import run_table
-from simpel_cli.commands.show import describe, publish
 from simpel_cli.config.launch import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.inference import loop
+from simpel_cli.reporting.fit import describe, publish
+from simpel_cli.reporting.run_table import run_table
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied, typed

@@ -23,9 +23,9 @@ from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.control.agents.rollout import Episodes
 from simpel_cli.control.plants.policy_files import contract, save_policy
 from simpel_cli.errors import ConfigError
-from simpel_cli.plots.canvas import with_interval
-from simpel_cli.plots.control import draw_control
-from simpel_cli.report import figure, write_report
+from simpel_cli.reporting.figures.canvas import with_interval
+from simpel_cli.reporting.figures.control import draw_control
+from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.runs.arrays import load_checkpoint
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied, typed

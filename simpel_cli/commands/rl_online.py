@@ -26,9 +26,9 @@ from simpel_cli.control.plants.policy_files import load_policy
 from simpel_cli.control.plants.returned_episodes import Answers
 from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError, did_you_mean
-from simpel_cli.plots.canvas import columns_of
-from simpel_cli.plots.control import draw_online
-from simpel_cli.report import figure, write_report
+from simpel_cli.reporting.figures.canvas import columns_of
+from simpel_cli.reporting.figures.control import draw_online
+from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
 from simpel_cli.runs.files import write_text

@@ -22,7 +22,7 @@ from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays
 from simpel_cli.inference import loop
 from simpel_cli.inference.assemble import assemble
-from simpel_cli.plots.canvas import COLOURS, new_figure, save
+from simpel_cli.reporting.figures.canvas import COLOURS, new_figure, save
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.settings import stream
 from simpel_cli.studies.study import STRETCH, Fitted, Study, open_study, prepare, resolved

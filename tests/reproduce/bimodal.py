@@ -14,8 +14,8 @@ import numpy as np
 
 from simpel_cli.inference.protocols import ScoreEstimator
 from simpel_cli.methods.fsvgd import FSVGD
-from simpel_cli.plots.canvas import COLOURS, new_figure, save
 from simpel_cli.priors.function_prior import SimulatorPrior
+from simpel_cli.reporting.figures.canvas import COLOURS, new_figure, save
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod

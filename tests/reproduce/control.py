@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from simpel_cli.plots.canvas import columns_of, legend_below, line_style, new_figure, save
+from simpel_cli.reporting.figures.canvas import columns_of, legend_below, line_style, new_figure, save
 from simpel_cli.runs.files import write_table, write_text
 from tests.reproduce.panel import CONF, Fit, run, tested, verdict
 from tests.reproduce.static import folder

@@ -20,7 +20,7 @@ import scipy.stats
 
 from simpel_cli.config.launch import launch
 from simpel_cli.errors import SimpelError
-from simpel_cli.plots.canvas import legend_below, line_style, new_figure, ratio_scale, save
+from simpel_cli.reporting.figures.canvas import legend_below, line_style, new_figure, ratio_scale, save
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import read_manifest
 from simpel_cli.runs.metrics import read_metrics

@@ -17,8 +17,8 @@ from simpel_cli.methods.fsvgd import FSVGD
 from simpel_cli.methods.greybox import GreyBox
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
-from simpel_cli.plots.canvas import BLACK, COLOURS, new_figure, save
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
+from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, new_figure, save
 from simpel_cli.scores.gaussian import Gaussian
 from simpel_cli.scores.kde import KDE
 from simpel_cli.scores.nu_method import NuMethod

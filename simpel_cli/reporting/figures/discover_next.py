@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from simpel_cli.plots.canvas import BLACK, COLOURS, DASHES, legend_below, new_figure, with_unit
+from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, DASHES, legend_below, new_figure, with_unit
 
 PREDICTED = "_if_"  # in a column: <channel>_if_<effect>
 

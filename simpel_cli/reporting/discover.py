@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.discover_report import HORIZONS, reliable, rows_of, sections_of, untested, words
 from simpel_cli.config.resolved import dump, load
 from simpel_cli.discovery.verdict.undetectable import in_words
-from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
-from simpel_cli.report import write_report
+from simpel_cli.reporting.discover_sections import HORIZONS, reliable, rows_of, sections_of, untested, words
+from simpel_cli.reporting.figures.canvas import columns_of, with_interval, with_unit
+from simpel_cli.reporting.html import write_report
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import typed
 

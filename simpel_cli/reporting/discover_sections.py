@@ -10,9 +10,9 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
 from simpel_cli.discovery.verdict.remainder import dependence
-from simpel_cli.plots import draw_discover
-from simpel_cli.plots.canvas import columns_of, with_interval, with_unit
-from simpel_cli.report import figure
+from simpel_cli.reporting.figures import draw_discover
+from simpel_cli.reporting.figures.canvas import columns_of, with_interval, with_unit
+from simpel_cli.reporting.html import figure
 
 AT_REST = -20.0  # nats: a fit so far below the model that it contains has not come to rest, and its spread says nothing
 NEAR_RANGE = 0.95  # share of a declared range that counts as all of it

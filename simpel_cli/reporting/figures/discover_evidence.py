@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, TIE
-from simpel_cli.plots.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
+from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
 
 LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge
 LINEAR = 10.0  # nats up to which the axis is linear; logarithmic beyond

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.plots.canvas import save
-from simpel_cli.plots.discover_evidence import draw_evidence, draw_parameters
-from simpel_cli.plots.discover_force import draw_effects, draw_residual
-from simpel_cli.plots.discover_next import draw_next
-from simpel_cli.plots.discover_runs import draw_errors, draw_traces, draw_whiteness
+from simpel_cli.reporting.figures.canvas import save
+from simpel_cli.reporting.figures.discover_evidence import draw_evidence, draw_parameters
+from simpel_cli.reporting.figures.discover_force import draw_effects, draw_residual
+from simpel_cli.reporting.figures.discover_next import draw_next
+from simpel_cli.reporting.figures.discover_runs import draw_errors, draw_traces, draw_whiteness
 
 
 def draw_discover(directory: Path) -> list[Path]:

@@ -6,7 +6,7 @@ from simpel_cli.data import Episode, Recording, origins
 from simpel_cli.data.split import PARTS  # also the names of episodes that no column names
 
 
-def extent_of_split(recording: Recording) -> str:
+def split_summary(recording: Recording) -> str:
     """Return e.g. `9 train / 3 test episodes`."""
     if _stand_alone(recording):
         return f"{_rows(recording.train)} train / {_rows(recording.test)} test rows"
@@ -19,7 +19,7 @@ def extent_of_split(recording: Recording) -> str:
     return text
 
 
-def extent_of_test(recording: Recording) -> str:
+def test_summary(recording: Recording) -> str:
     """Return e.g. `3 episodes` or `1 episode in 4 segments`."""
     if _stand_alone(recording):
         return _counted(_rows(recording.test), "row")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.likelihood.whiteness import autocorrelation, cumulated_periodogram
-from simpel_cli.plots.canvas import (
+from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
     columns_of,

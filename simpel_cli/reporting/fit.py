@@ -5,15 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.extent import extent_of_split, extent_of_test
-from simpel_cli.commands.run_table import named_method
 from simpel_cli.data import Recording
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.inference.prior_predictive import PriorCheck
 from simpel_cli.inference.protocols import Method
-from simpel_cli.plots import draw_run
-from simpel_cli.report import figure, write_report
+from simpel_cli.reporting.data_summary import split_summary, test_summary
+from simpel_cli.reporting.figures import draw_run
+from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.reporting.prior_check import describe_prior
+from simpel_cli.reporting.run_table import named_method
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed
 from simpel_cli.studies.judgement import Judged
@@ -44,7 +44,7 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
         style="bold",
     )
     rows = len(fitted.training[0][0])
-    describe_data(terminal, recording, f"{extent_of_split(recording)}, {used(study.method, source, rows)}")
+    describe_data(terminal, recording, f"{split_summary(recording)}, {used(study.method, source, rows)}")
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (queried)"
     terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
@@ -110,9 +110,9 @@ def publish(
         source: directory of the fit that was evaluated.
     """
     values = _by_metric(judged.rows)
-    extent = extent_of_test(study.recording)
+    tested = test_summary(study.recording)
     terminal.line()
-    terminal.line(f"{f'test ({extent})':<20}{_headline(study, values)}")
+    terminal.line(f"{f'test ({tested})':<20}{_headline(study, values)}")
     table = _table(study, values)
     terminal.line(aligned(table["head"], table["rows"]))
     free = _free_run_table(study, values)
@@ -135,7 +135,7 @@ def publish(
     report = write_report(
         directory / "report.html",
         title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
-        lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {extent}, seeds {s.all_seeds}. "
+        lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {tested}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
         sections=[*tables, run, checks, *(figure(path) for path in (draw_run(directory) if s.figures else []))],
         commands=next_commands,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.plots.canvas import (
+from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
     DASHES,

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.evaluation.comparison import METRICS, Mean, Metric, best, by_seed, difference, points, variant
-from simpel_cli.plots.canvas import columns_of, distinct, with_interval
-from simpel_cli.plots.compare import Course, draw_calibrations, draw_courses
-from simpel_cli.plots.sweep import draw_by_size
-from simpel_cli.report import figure
+from simpel_cli.reporting.figures.canvas import columns_of, distinct, with_interval
+from simpel_cli.reporting.figures.compare import Course, draw_calibrations, draw_courses
+from simpel_cli.reporting.figures.sweep import draw_by_size
+from simpel_cli.reporting.html import figure
+from simpel_cli.reporting.tables import write_csv, write_latex
 from simpel_cli.runs.finding import Found
-from simpel_cli.tables import write_csv, write_latex
 
 COURSES = {  # verb -> metric, its split, what it runs along, what it is called
     "fit": ("loss", "train", "step", "loss: NLL per point [nat]"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from simpel_cli.commands.extent import extent_of_split, extent_of_test
 from simpel_cli.data import Episode, Recording
+from simpel_cli.reporting.data_summary import split_summary, test_summary
 
 
 def part(*names: str, states: int = 1, pairs: bool = False) -> tuple[Episode, ...]:
@@ -30,5 +30,5 @@ def recording(train: tuple[Episode, ...], test: tuple[Episode, ...]) -> Recordin
     ],
 )  # fmt: skip
 def test_extent(train: tuple[Episode, ...], test: tuple[Episode, ...], split: str, judged: str) -> None:
-    assert extent_of_split(recording(train, test)) == split
-    assert extent_of_test(recording(train, test)) == judged
+    assert split_summary(recording(train, test)) == split
+    assert test_summary(recording(train, test)) == judged

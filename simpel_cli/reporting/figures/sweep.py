@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.evaluation.comparison import METRICS, Point, by_seed, points
-from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, ratio_scale, save
+from simpel_cli.reporting.figures.canvas import distinct, legend_below, line_style, new_figure, ratio_scale, save
 from simpel_cli.runs.metrics import read_metrics
 
 FARTHEST = 5.0  # a line that would stretch the axis more than so many times is not followed

@@ -5,7 +5,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.plots.canvas import BLACK, COLOURS, columns_of, distinct, legend_below, new_figure, units_of, with_unit
+from simpel_cli.reporting.figures.canvas import (
+    BLACK,
+    COLOURS,
+    columns_of,
+    distinct,
+    legend_below,
+    new_figure,
+    units_of,
+    with_unit,
+)
 
 BINS = 14
 LEAST = 6  # rows of a bin

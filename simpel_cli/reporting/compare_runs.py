@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.commands.compare import Comparison, Run
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
-from simpel_cli.plots.canvas import distinct
-from simpel_cli.report import write_report
+from simpel_cli.reporting.comparison import Comparison, Run
+from simpel_cli.reporting.figures.canvas import distinct
+from simpel_cli.reporting.html import write_report
+from simpel_cli.reporting.tables import write_csv, write_latex
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, typed
 from simpel_cli.runs.finding import Found, runs_below
 from simpel_cli.runs.manifest import read_manifest
 from simpel_cli.runs.metrics import read_metrics
-from simpel_cli.tables import write_csv, write_latex
 
 NAMED = 20  # of the runs that are not done
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.plots.canvas import distinct, legend_below, line_style, new_figure, save
+from simpel_cli.reporting.figures.canvas import distinct, legend_below, line_style, new_figure, save
 
 MOST_LINES = 60  # of a panel; of more, every k-th is drawn
 EARLY = 0.05  # of a run, whose fall is not what one looks for
