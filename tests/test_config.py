@@ -14,8 +14,8 @@ from simpel_cli.config.nodes import build
 from simpel_cli.config.overrides import checked, count_jobs
 from simpel_cli.config.places import conf_dir
 from simpel_cli.data import Measurements
+from simpel_cli.evaluation.settings import Evaluation
 from simpel_cli.runs.settings import Settings
-from simpel_cli.studies.study import Evaluation
 from simulators.built import Built
 from simulators.model import Model
 from simulators.worlds.simulate import Simulate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data import Episode, Recording
-from simpel_cli.reporting.data_summary import split_summary, test_summary
+from simpel_cli.data.summary import held_out_summary, split_summary
 
 
 def part(*names: str, states: int = 1, pairs: bool = False) -> tuple[Episode, ...]:
@@ -31,4 +31,4 @@ def recording(train: tuple[Episode, ...], test: tuple[Episode, ...]) -> Recordin
 )  # fmt: skip
 def test_extent(train: tuple[Episode, ...], test: tuple[Episode, ...], split: str, judged: str) -> None:
     assert split_summary(recording(train, test)) == split
-    assert test_summary(recording(train, test)) == judged
+    assert held_out_summary(recording(train, test)) == judged

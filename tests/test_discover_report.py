@@ -13,9 +13,9 @@ import searches
 from simpel_cli.reporting.discover import next_commands, publish
 from simpel_cli.reporting.discover_sections import equation_section, marked, next_section, prior_section, untested
 from simpel_cli.reporting.figures import discover_evidence, discover_force, discover_next, discover_runs, draw_discover
-from simpel_cli.reporting.figures.canvas import columns_of, units_of, with_interval
+from simpel_cli.reporting.figures.canvas import with_interval
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.files import write_table
+from simpel_cli.runs.files import read_columns, read_units, write_table
 
 KINDS = ("effect", "ambiguous", "none", "unexplained")
 
@@ -151,7 +151,7 @@ def test_numbers_have_the_digits_that_their_interval_allows(numbers: tuple[float
 
 def test_units_of_columns_come_back(tmp_path: Path) -> None:
     write_table(tmp_path / "t.parquet", {"time": [0.0], "n": [1]}, {"time": "s", "absent": "m"})
-    assert units_of(tmp_path / "t.parquet") == {"time": "s"}
+    assert read_units(tmp_path / "t.parquet") == {"time": "s"}
     assert pq.read_table(tmp_path / "t.parquet").to_pydict() == {"time": [0.0], "n": [1]}
 
 
@@ -196,7 +196,7 @@ def test_evidence_shows_accepted_tied_and_hopeless(tmp_path: Path) -> None:
 
 def test_the_typical_episode_is_shown(tmp_path: Path) -> None:
     searches.directory(tmp_path, "effect")
-    assert discover_runs.typical_episode(columns_of(tmp_path / "trajectories.parquet")) == "c"
+    assert discover_runs.typical_episode(read_columns(tmp_path / "trajectories.parquet")) == "c"
 
 
 def test_bins_average_and_say_how_surely() -> None:

@@ -135,8 +135,10 @@ print(json.dumps({"mean": now.mean, "std": now.std, "course": course.tolist()}))
 
 
 def test_numpy_predicts_what_the_posterior_does(fitted: Path, tmp_path: Path) -> None:
-    from simpel_cli.commands.fit import checkpointed_state
-    from simpel_cli.studies.study import open_study, posteriors, prepare
+    from simpel_cli.studies.declared import declare
+    from simpel_cli.studies.open import open_study
+    from simpel_cli.studies.prepare import posteriors, prepare
+    from simpel_cli.studies.training import checkpointed_state
 
     assert simpel(tmp_path, "export", fitted, "--out", "out", "--seed", "1").code == 0
     shown = subprocess.run(
@@ -144,7 +146,7 @@ def test_numpy_predicts_what_the_posterior_does(fitted: Path, tmp_path: Path) ->
     )
     assert shown.returncode == 0, shown.stderr
     found = json.loads(shown.stdout)
-    study = open_study(load(fitted / "config.yaml"), fitted)
+    study = open_study(declare(load(fitted / "config.yaml")), fitted)
     _, state, bound = checkpointed_state(fitted, prepare(study))
     posterior, encoding = posteriors(study, bound, state)[1], study.system.encoding
     s, u = np.array([[3.1, 0.3]]), np.array([[1.5]])

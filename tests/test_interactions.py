@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_discovery_filter import DT, LOAD, model, recording
 
-from simpel_cli.commands.discover import _gated, _of_two
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.coordinates import CUT
 from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
+from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.interactions import BASES, carried, names_of
 from simpel_cli.discovery.search.noise_profile import Levels
@@ -110,8 +110,10 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     plan = attach()
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
-    selection, gates, _ = _gated(search, assessor, select(search), terminal)
-    left, gates = _of_two(Levels(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal)
+    selection, gates, _ = gated_selection(search, assessor, select(search), terminal)
+    left, gates = with_interactions(
+        Levels(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal
+    )
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left
 

@@ -19,18 +19,18 @@ import pytest
 import yaml
 from command_line import ROOT, simpel
 
-from simpel_cli.commands.control import assignment, world_of_posterior
-from simpel_cli.commands.fit import learned
 from simpel_cli.config.nodes import build
 from simpel_cli.config.resolved import load
 from simpel_cli.control.agents.policy import Actor, Policy
 from simpel_cli.control.agents.rollout import episodes, reflex
-from simpel_cli.control.plants.environments import GymnasiumRig, WorldRig
+from simpel_cli.control.assignment import assignment
+from simpel_cli.control.plants.environments import GymnasiumEnvironment, WorldEnvironment
 from simpel_cli.control.plants.exchange import Exchange
-from simpel_cli.control.plants.plant import Ride, Simulated, Stepped, earned, write_ride
+from simpel_cli.control.plants.plant import PlantEpisode, Simulated, Stepped, earned, write_episode
 from simpel_cli.control.plants.policy_files import contract, load_policy, save_policy
-from simpel_cli.control.plants.returned_episodes import Answers
+from simpel_cli.control.plants.returned_episodes import ReturnedEpisodes
 from simpel_cli.control.plants.runner import PolicyRunner
+from simpel_cli.control.posterior_world import world_of_posterior
 from simpel_cli.control.task import Task
 from simpel_cli.control.world import true_world
 from simpel_cli.data import Measurements, read
@@ -38,10 +38,13 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.inference.networks import MLP
+from simpel_cli.reporting.fit import SCREEN
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics
 from simpel_cli.runs.settings import stream
-from simpel_cli.studies.study import settings_of
+from simpel_cli.studies.declared import declare
+from simpel_cli.studies.fit import learned
+from simpel_cli.studies.open import open_study
 
 HORIZON = 12
 FLOAT32 = jnp.dtype("float32")
@@ -76,7 +79,7 @@ def test_a_simulated_episode_is_what_its_rows_say(swing: tuple[Any, Encoding, Ta
     step = transition(model, encoding).step
     world = true_world(encoding, goal, step, phi, jnp.zeros(2, jnp.float32))
     plant = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3))
-    ride = plant.ride(0, tmp_path)
+    ride = plant.episode(0, tmp_path)
     assert ride.states.shape == (HORIZON + 1, 2)
     assert ride.commands.shape == (HORIZON, 1)
     x = jnp.concatenate([encoding.encode(jnp.asarray(ride.states[:-1])), jnp.asarray(ride.commands)], axis=1)
@@ -84,9 +87,9 @@ def test_a_simulated_episode_is_what_its_rows_say(swing: tuple[Any, Encoding, Ta
     np.testing.assert_allclose(encoding.decode(after), ride.states[1:], atol=2e-5)
     judged = goal.judge(jnp.asarray(ride.states[1:]), jnp.asarray(ride.commands), jnp.asarray(ride.commands))
     np.testing.assert_allclose(judged.reward, ride.reward, atol=2e-5)
-    other = plant.ride(1, tmp_path)
+    other = plant.episode(1, tmp_path)
     assert not np.allclose(other.states, ride.states)
-    np.testing.assert_array_equal(plant.ride(0, tmp_path).states, ride.states)
+    np.testing.assert_array_equal(plant.episode(0, tmp_path).states, ride.states)
 
 
 def test_an_episode_is_read_as_it_was_written(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
@@ -96,8 +99,8 @@ def test_an_episode_is_read_as_it_was_written(swing: tuple[Any, Encoding, Task],
     phi = jnp.asarray([q.middle for q in model.params], jnp.float32)
     noise = jnp.full(2, 0.05, jnp.float32)
     world = true_world(encoding, goal, transition(model, encoding).step, phi, noise)
-    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).ride(0, tmp_path)
-    write_ride(tmp_path / "000.parquet", ride, encoding, model.dt)
+    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).episode(0, tmp_path)
+    write_episode(tmp_path / "000.parquet", ride, encoding, model.dt)
     asked = Measurements(path=(str(tmp_path / "000.parquet"),), time="t", split={"test_fraction": 0})
     recording = read(asked, model, tmp_path, 0)
     assert recording.test == ()
@@ -113,21 +116,21 @@ def test_the_mujoco_car_is_driven(tmp_path: Path) -> None:
     goal = task.bind(encoding)
     policy_in(tmp_path, encoding, task, 3)
     world = build(of_conf("sim", "rc_car_world"), "sim").model()
-    rig = WorldRig(world, encoding, goal, model.dt, np.zeros(6), jax.random.key(0))
-    ride = Stepped(rig, encoding, goal, HORIZON).ride(0, tmp_path)
+    rig = WorldEnvironment(world, encoding, goal, model.dt, np.zeros(6), jax.random.key(0))
+    ride = Stepped(rig, encoding, goal, HORIZON).episode(0, tmp_path)
     assert ride.states.shape == (HORIZON + 1, 6)
     low, high = np.array(goal.low), np.array(goal.high)
     assert ((ride.commands >= low) & (ride.commands <= high)).all()
     moved = np.hypot(*(ride.states - ride.states[0])[:, :2].T)
     assert moved[2] < 0.01 < moved[-1]  # nothing arrives within the first three steps
-    noisy = WorldRig(world, encoding, goal, model.dt, np.full(6, 0.1), jax.random.key(0))
+    noisy = WorldEnvironment(world, encoding, goal, model.dt, np.full(6, 0.1), jax.random.key(0))
     assert 0.01 < np.abs(noisy.reset(0) - rig.reset(0)).max() < 0.5
     np.testing.assert_array_equal(noisy.reset(1), noisy.reset(1))
     bare = encoding_of(build(of_conf("sim", "pendulum"), "sim").model())
     with pytest.raises(ConfigError, match=r"states of rc_car_world are x, y, .*; those of sim are phi, omega"):
-        WorldRig(world, bare, goal, model.dt, np.zeros(2), jax.random.key(0))
+        WorldEnvironment(world, bare, goal, model.dt, np.zeros(2), jax.random.key(0))
     with pytest.raises(ConfigError, match=r"a step of rc_car_world is 0\.0333.* s; one of sim is 0\.05 s"):
-        WorldRig(world, encoding, goal, 0.05, np.zeros(6), jax.random.key(0))
+        WorldEnvironment(world, encoding, goal, 0.05, np.zeros(6), jax.random.key(0))
 
 
 class Cart:
@@ -170,7 +173,7 @@ def test_a_gymnasium_environment_is_driven(
     """It ends where it says so, and where a state is not finite: that row is no measurement."""
     _, encoding, task = swing
     policy_in(tmp_path, encoding, task, 0)
-    ride = Stepped(GymnasiumRig(name, encoding, 0), encoding, task.bind(encoding), HORIZON).ride(0, tmp_path)
+    ride = Stepped(GymnasiumEnvironment(name, encoding, 0), encoding, task.bind(encoding), HORIZON).episode(0, tmp_path)
     assert ride.states.shape == (steps + 1, 2)
     assert np.isfinite(ride.states).all()
     assert ride.reward.shape == ride.good.shape == (steps,)
@@ -209,7 +212,7 @@ def test_a_simulator_that_cannot_go_on_ends_the_episode(swing: tuple[Any, Encodi
         return jnp.array([0.0, 0.0, 1.0], x.dtype) + jnp.where(x[2] > 3.5, jnp.nan, 0.0).astype(x.dtype) * turned
 
     world = true_world(encoding, goal, step, jnp.zeros(0), jnp.zeros(2, jnp.float32))
-    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).ride(0, tmp_path)
+    ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).episode(0, tmp_path)
     speeds = ride.states[:, 1]
     assert 2 <= len(speeds) <= 6
     np.testing.assert_allclose(np.diff(speeds), 1.0, atol=1e-5)
@@ -219,21 +222,21 @@ def test_a_simulator_that_cannot_go_on_ends_the_episode(swing: tuple[Any, Encodi
 def test_an_environment_that_cannot_be_used(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
     _, encoding, task = swing
     with pytest.raises(ConfigError, match="gymnasium cannot make 'nothing': no such environment"):
-        GymnasiumRig("nothing", encoding, 0)
+        GymnasiumEnvironment("nothing", encoding, 0)
     policy_in(tmp_path, encoding, task, 0)
-    rig = GymnasiumRig("breaks_at_once", encoding, 0)
+    rig = GymnasiumEnvironment("breaks_at_once", encoding, 0)
     with pytest.raises(DataError, match="no step was possible"):
-        Stepped(rig, encoding, task.bind(encoding), HORIZON).ride(0, tmp_path)
+        Stepped(rig, encoding, task.bind(encoding), HORIZON).episode(0, tmp_path)
 
 
-def anything(number: int, ride: Ride) -> None:
+def anything(number: int, ride: PlantEpisode) -> None:
     """Accept every episode."""
 
 
 def exchange_of(
     folder: Path, encoding: Encoding, task: Task, wait: float, run: str, said: list[str], accept: Any = anything
 ) -> Exchange:
-    answers = Answers(encoding, task.bind(encoding), replace(task, horizon=HORIZON), 0.05, said.append)
+    answers = ReturnedEpisodes(encoding, task.bind(encoding), replace(task, horizon=HORIZON), 0.05, said.append)
     return Exchange(folder, answers, wait, run, accept, said.append, lambda: None)
 
 
@@ -257,7 +260,7 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     folder = tmp_path / "rig"
     refused: list[int] = []
 
-    def accept(number: int, ride: Ride) -> None:
+    def accept(number: int, ride: PlantEpisode) -> None:
         if not refused:
             refused.append(number)
             raise DataError("a fit can make nothing of it")
@@ -288,7 +291,7 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
 
     thread = threading.Thread(target=rig, daemon=True)
     thread.start()
-    ride = exchange.ride(2, tmp_path / "policy")
+    ride = exchange.episode(2, tmp_path / "policy")
     thread.join()
     assert ride.states.shape == (HORIZON + 1, 2)
     problems = [(folder / f"episode_002.refused-{i}.txt").read_text() for i in range(1, 8)]
@@ -306,10 +309,10 @@ def test_a_rig_behind_a_folder(swing: tuple[Any, Encoding, Task], tmp_path: Path
     assert refused == [2]
     assert len(list(folder.glob("*.refused-*.parquet"))) == 7
     assert "waiting for" in said[0]
-    np.testing.assert_allclose(exchange.ride(2, tmp_path / "policy").states, ride.states)  # still there: taken again
+    np.testing.assert_allclose(exchange.episode(2, tmp_path / "policy").states, ride.states)  # still there: taken again
     other = exchange_of(folder, encoding, task, 60.0, "another", said)
     with pytest.raises(DataError, match=r"is there, but this run did not ask for it"):
-        other.ride(2, tmp_path / "policy")
+        other.episode(2, tmp_path / "policy")
 
 
 def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path: Path) -> None:
@@ -317,7 +320,7 @@ def test_a_rig_that_does_not_answer(swing: tuple[Any, Encoding, Task], tmp_path:
     policy_in(tmp_path / "policy", encoding, task, 0)
     exchange = exchange_of(tmp_path / "rig", encoding, task, 0.1, "mine", [])
     with pytest.raises(DataError, match=r"did not come within 0.1 s .*--resume"):
-        exchange.ride(0, tmp_path / "policy")
+        exchange.episode(0, tmp_path / "policy")
     assert (tmp_path / "rig" / "episode_000" / "run_policy.py").exists()
 
 
@@ -337,11 +340,11 @@ def test_what_is_odd_about_an_answer_is_said(swing: tuple[Any, Encoding, Task], 
     folder, other = tmp_path / "rig", tmp_path / "rig" / "episode_000"
     exchange = exchange_of(folder, encoding, task, 0.0, "mine", said)
     with pytest.raises(DataError, match="did not come within"):
-        exchange.ride(0, tmp_path / "policy")
+        exchange.episode(0, tmp_path / "policy")
     good = answer_of(other, HORIZON + 5)
     odd = {"u": 0.9 * np.sign(good["u"] + 1e-9), "omega": good["omega"] + 20 * (np.arange(HORIZON + 5) == 4) + 0.5}
     write_table(folder / "episode_000.parquet", good | odd)
-    ride = exchange.ride(0, tmp_path / "policy")
+    ride = exchange.episode(0, tmp_path / "policy")
     assert ride.states.shape == (HORIZON + 1, 2)
     every = " ".join(said)
     for words in (
@@ -356,11 +359,11 @@ def test_what_is_odd_about_an_answer_is_said(swing: tuple[Any, Encoding, Task], 
     exchange.withdraw(0)
     theirs = exchange_of(folder, encoding, task, 0.0, "theirs", said)
     with pytest.raises(DataError, match="is of another run, which waits for"):
-        theirs.ride(0, tmp_path / "policy")
+        theirs.episode(0, tmp_path / "policy")
     (other / "request.json").write_text("{}")  # somebody did
     write_table(folder / "episode_000.parquet", good)
     with pytest.raises(DataError, match="this run did not ask for it"):
-        exchange.ride(0, tmp_path / "policy")
+        exchange.episode(0, tmp_path / "policy")
 
 
 def test_a_reward_that_is_no_number(swing: tuple[Any, Encoding, Task]) -> None:
@@ -427,9 +430,10 @@ def test_the_run_holds_what_is_promised(driven: Path) -> None:
 def test_no_policy_earns_less_in_the_model_than_the_one_before(driven: Path) -> None:
     """A training that ends in a local optimum costs no episode: what is acted by is at least as good there as what was."""
     config = load(driven / "config.yaml")
-    asked = assignment(config, settings_of(config))
+    asked = assignment(declare(config))
     folder = driven / "rounds" / "001"
-    model = learned(load(folder / "posterior" / "config.yaml"), folder / "posterior", driven, shown=False)
+    study = open_study(declare(load(folder / "posterior" / "config.yaml")), driven)
+    model = learned(study, folder / "posterior", SCREEN, shown=False)
     arrays = jax.tree.map(lambda a: jnp.asarray(a)[0], (model.fitted.assembled.problems, model.state))
     world = world_of_posterior(model, asked)(arrays, 0.0)
     actor = asked.policy.bind(world, asked.task.horizon, len(asked.encoding.inputs)).actor

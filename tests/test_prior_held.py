@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from command_line import simpel
 
-from simpel_cli.commands.fit import learned
 from simpel_cli.config.resolved import load
 from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays as arrays_of
-from simpel_cli.studies.study import posteriors
+from simpel_cli.reporting.fit import SCREEN
+from simpel_cli.studies.declared import declare
+from simpel_cli.studies.fit import learned
+from simpel_cli.studies.open import open_study
+from simpel_cli.studies.prepare import posteriors
 
 
 @pytest.mark.slow
@@ -31,7 +34,8 @@ def test_the_posterior_of_no_data_turns_with_the_steering(tmp_path: Path) -> Non
         "run.figures=false",
     )
     assert result.code == 0, result.err
-    model = learned(load(tmp_path / "run" / "config.yaml"), tmp_path / "run", tmp_path, shown=False)
+    study = open_study(declare(load(tmp_path / "run" / "config.yaml")), tmp_path)
+    model = learned(study, tmp_path / "run", SCREEN, shown=False)
     study = model.study
     encoding = study.system.encoding
     x = arrays_of(transitions(study.recording.train, encoding.stack), encoding)[0][::20]

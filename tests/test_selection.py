@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simpel_cli.commands import discover
-from simpel_cli.commands.discover import _calibrated, _gated
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
 from simpel_cli.discovery.measurements.cleaning import Cleaned
+from simpel_cli.discovery.search import acceptance, calibration
+from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
+from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.gate import Gate
 from simpel_cli.discovery.search.score_test import Score
@@ -249,8 +250,10 @@ def test_what_the_gate_refuses_hides_no_other_effect(
         # the first is the more uncertain one
         return [Gate(1.0, i - 9.0, 2.0, "episode", harm and n in fail, n not in fail) for i, n in enumerate(names)]
 
-    monkeypatch.setattr(discover, "gates", judge)
-    kept, judged, without = _gated(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
+    monkeypatch.setattr(acceptance, "gates", judge)
+    kept, judged, without = gated_selection(
+        search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log")
+    )
     assert [search.terms[t].effect for t in kept.chosen.terms] == list(left)
     assert len(judged) == len(kept.gains) == len(kept.classes) == len(left)
     assert [search.terms[t].effect for t in without] == list(again)
@@ -263,8 +266,10 @@ def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.Monk
         names = [search.terms[t].effect for t in whole.terms]
         return [Gate(1.0, -1.0, 2.0, "episode", False, name == "B") for name in names]
 
-    monkeypatch.setattr(discover, "gates", judge)
-    kept, judged, _ = _gated(search, Assessor(search.plan, 5), select(search), Terminal(True, tmp_path / "run.log"))
+    monkeypatch.setattr(acceptance, "gates", judge)
+    kept, judged, _ = gated_selection(
+        search, Assessor(search.plan, 5), select(search), Terminal(True, tmp_path / "run.log")
+    )
     assert kept.chosen.terms == ()
     assert judged == []
 
@@ -283,10 +288,10 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
         "without_new": lambda clean, _, after, __: (clean, after),
         "Search": lambda *_: table.search,
     }.items():
-        monkeypatch.setattr(discover, name, stub)
+        monkeypatch.setattr(calibration, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
     plan = real.plan._replace(spare=test)
-    search, _, left, _ = _calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
+    search, _, left, _ = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
     np.testing.assert_array_equal(left.ok, none_left)
     np.testing.assert_array_equal(search.plan.spare.ok, none_left)  # what is held out to judge effects
 
@@ -343,12 +348,12 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
         return selection, [selection], [1]
 
     count = iter(range(100))
-    monkeypatch.setattr(discover, "_gated", gated)
-    monkeypatch.setattr(discover, "select", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=())))
-    monkeypatch.setattr(discover, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
+    monkeypatch.setattr(acceptance, "gated_selection", gated)
+    monkeypatch.setattr(acceptance, "select", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=())))
+    monkeypatch.setattr(acceptance, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
     none: Any = None
     options: Any = SimpleNamespace(beginnings=0)
     search: Any = SimpleNamespace(banned=set())
-    selection, gates = unwrap(discover._selected)(search, none, none, options, none)
-    assert len(judged) == discover.MOST_SEARCHES
+    selection, gates = unwrap(accepted)(search, none, none, options, none)
+    assert len(judged) == MOST_SEARCHES
     assert gates == [selection]

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import FIT, PATIENCE, TINY, environment, rows, simpel, start
 
-from simpel_cli.commands.cluster import Options
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.lock import is_locked, locked
+from simpel_cli.sweeps.cluster import Options
 
 # long enough to be killed amid it; the same job several times, so that each says what the others should have come to
 LONG = ("experiment=pendulum", *TINY, "method.steps=3000", "run.quiet=false")
@@ -160,7 +160,7 @@ def test_another_launcher_that_fails_by_itself(tmp_path: Path, monkeypatch: pyte
     def launch(*_: object, **__: object) -> None:
         raise OSError("no such partition")
 
-    monkeypatch.setattr("simpel_cli.commands.sweep.launch", launch)
+    monkeypatch.setattr("simpel_cli.sweeps.sweep.launch", launch)
     result = simpel(tmp_path, "sweep", "experiment=pendulum", *TINY, "run.seed=0,1", "hydra/launcher=basic")
     assert result.code == 1
     assert "error: hydra/launcher=basic: OSError: no such partition" in result.err
@@ -224,7 +224,7 @@ def test_wrong_options(given: dict[str, object], message: str) -> None:
 
 
 def test_nobody_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simpel_cli.commands.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("simpel_cli.sweeps.cluster.PATIENCE", 0.5)
     words = ("experiment=pendulum", *TINY, "run.seed=0,1", "hydra.sweep.dir=sweep")
     result = simpel(tmp_path, "sweep", *words, "hydra.launcher.address=tcp://127.0.0.1:9")
     assert result.code == 2

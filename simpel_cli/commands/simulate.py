@@ -1,38 +1,17 @@
-"""`simpel simulate`: a simulator or a MuJoCo world becomes measurements, as Parquet plus card."""
+"""`simpel simulate`: measurements made by a simulator."""
 
-from pathlib import Path
-
-from simpel_cli.config.launch import Job
-from simpel_cli.config.nodes import build
-from simpel_cli.config.resolved import dump
-from simpel_cli.errors import ConfigError
-from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied
-from simpel_cli.runs.files import write_table, write_text
-from simpel_cli.runs.manifest import Manifest
-from simpel_cli.studies.study import settings_of, source_of
-from simulators.worlds.simulate import Simulate
+from simpel_cli.commands.launching import launch
+from simpel_cli.commands.options import Cfg, ConfigDir, Overrides
 
 
-def simulate(job: Job) -> None:
-    """Simulate and write `measurements.parquet` and `card.yaml`."""
-    settings = settings_of(job.config)
-    out = job.config["out"]
-    refuse_occupied(job.directory)
-    directory = make_directory(Path(out) if out else job.directory, "out" if out else "hydra.run.dir")
-    path = directory / "measurements.parquet"
-    if path.exists():
-        raise ConfigError(f"out: {path} exists; remove it, or choose another folder. Nothing was changed.")
-    terminal = Terminal(settings.quiet)
-    simulation = build(job.config["simulation"], "simulation", settings.plugins, default=Simulate)
-    source = source_of(job.config, settings)
-    with Manifest(make_directory(job.directory), "simulate", settings):
-        try:
-            made = simulation.run(source)
-        except ValueError as error:  # simulators.model.ModelError
-            raise ConfigError(str(error)) from error
-        write_table(path, made.columns)
-        write_text(directory / "card.yaml", dump(made.card))
-    rows = len(next(iter(made.columns.values())))
-    terminal.line(f"{path}   {rows} rows: {', '.join(made.columns)}", "data")
-    terminal.line(str(directory / "card.yaml"), "card")
+def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
+    """Turn a simulator or a MuJoCo world into measurements: Parquet and card.
+
+    Examples:
+      simpel simulate sim=pendulum_world out=data/pendulum
+
+      simpel simulate --config-dir my sim=rig simulation.episodes=20 simulation.seed=1 out=my/data/rig
+    """
+    from simpel_cli.studies.simulate import simulate as task
+
+    launch("simulate", task, overrides, config_dir, cfg)

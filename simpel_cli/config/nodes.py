@@ -1,8 +1,8 @@
 """Config nodes to dataclasses: plain mappings in, objects out.
 
-A config node is `_target_:` plus the fields of one frozen dataclass; the dataclass is schema, defaults, documentation
-and validator. `_target_` reaches simpel_cli, simulators and the packages named in `run.plugins`, nothing else: a YAML
-file cannot call arbitrary code.
+A config node holds the fields of one frozen dataclass, which `_target_:` names where the group has no obvious one; the
+dataclass is schema, defaults, documentation and validator. `_target_` reaches simpel_cli, simulators and the packages named
+in `run.plugins`, nothing else: a YAML file cannot call arbitrary code.
 """
 
 import collections.abc
@@ -13,30 +13,23 @@ import inspect
 import re
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any
 
+from simpel_cli.config.classes import CLASSES, PLAIN_KEYS, ROLES, SIMULATORS, obvious_class
 from simpel_cli.errors import ConfigError, did_you_mean
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
-ROLES = {
-    "sim": "model",
-    "prior": "uses_simulator",
-    "score": "gap_draws",
-    "method": "bind",
-    "policy": "bind",
-    "planner": "bind",
-    "reward": "bind",
-}
 
 
 def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type | None = None) -> Any:
     """Build the dataclass that a config node declares.
 
     Args:
-        node: mapping with `_target_` (or without, if `default` is given) and the dataclass's fields.
+        node: mapping of the dataclass's fields, with `_target_` where the group has no obvious class.
         path: where the node stands, for messages, e.g. `method`.
         plugins: further packages that `_target_` may name.
-        default: dataclass of a node without `_target_`.
+        default: dataclass of a node without `_target_`; None: that of the group, if it has an obvious one.
 
     Raises:
         ConfigError: an unknown key, a wrong type, a target outside the fence, or what the dataclass itself refuses.
@@ -45,9 +38,11 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
         raise ConfigError(f"{path}: got {node!r}; expected a mapping of keys.")
     fields = {str(k): v for k, v in node.items() if k != "_target_"}
     target = node.get("_target_")
-    cls = _resolve(str(target), path, plugins) if target is not None else default
+    cls = _resolve(str(target), path, plugins) if target is not None else default or obvious_class(path)
     if cls is None:
-        raise ConfigError(f"{path}: the key _target_ is missing; it names the class, e.g. simulators.model.Declared.")
+        raise ConfigError(
+            f"{path}: the key _target_ is missing; it names the class, as the options in conf/{path}/ do."
+        )
     role = ROLES.get(path)
     if role is not None and role not in {*dir(cls), *(f.name for f in dataclasses.fields(cls))}:
         raise ConfigError(f"{path}._target_: {target} is no {path}; the options in conf/{path}/ show what is.")
@@ -65,6 +60,45 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
         return cls(**values)
     except ValueError as error:  # e.g. simulators.model.ModelError, which knows nothing of simpel_cli
         raise ConfigError(str(error)) from error
+
+
+def build_source(node: Any, path: str, plugins: tuple[str, ...] = ()) -> Any:
+    """Build a simulator: a symbolic model, or a world with query access only.
+
+    Raises:
+        ConfigError: as `build`, or the model cannot be made of what is declared.
+    """
+    declared = build(node, path, plugins)
+    try:
+        return declared.model()
+    except ValueError as error:  # simulators.model.ModelError
+        raise ConfigError(str(error)) from error
+
+
+def build_groups(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Build every group of a configuration, once; one that is null stays None. `effect` becomes a list.
+
+    Raises:
+        ConfigError: a key that no verb has, or what a group's class refuses.
+    """
+    for key in config:
+        if key not in CLASSES and key not in PLAIN_KEYS:
+            groups = list(CLASSES)
+            raise ConfigError(f"{key}: no such key.{did_you_mean(key, groups)} (groups: {', '.join(groups)})")
+    built: dict[str, Any] = {"run": build(config.get("run") or {}, "run")}
+    plugins = built["run"].plugins
+    for name, node in config.items():
+        if name in CLASSES and name != "run":
+            built[name] = None if node is None else _build_group(node, name, plugins)
+    return built
+
+
+def _build_group(node: Any, name: str, plugins: tuple[str, ...]) -> Any:
+    if name in SIMULATORS:
+        return build_source(node, name, plugins)
+    if name == "effect" and isinstance(node, dict):
+        return [build(dict(entry), f"effect.{key}", plugins) for key, entry in node.items()]
+    return build(node, name, plugins)
 
 
 def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:

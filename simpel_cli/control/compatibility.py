@@ -9,7 +9,7 @@ from simulators.model import Model
 from simulators.worlds.world import World
 
 
-def check_comparable(
+def check_compatible(
     key: str, other: Model | World, encoding: Encoding, goal: Goal, dt: float, *, by_name: bool = False
 ) -> None:
     """Refuse a system of other quantities, units, angles or steps, or one that does not take the commands.

@@ -4,6 +4,13 @@ from dataclasses import dataclass
 
 from simpel_cli.errors import ConfigError, check_at_least_one
 
+MEASURED = (
+    "noise_std",
+    "stack_actions",
+    "max_gap",
+    "derived",
+)  # keys of the data YAML that hold for a plant's episodes
+
 
 @dataclass(frozen=True)
 class Online:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from simpel_cli.control.world import SAMPLING
 from simpel_cli.errors import ConfigError, check_at_least_one, did_you_mean
 
+# groups and keys of a configuration that a fit does not have
+CONTROL_GROUPS = ("policy", "planner", "reward", "truth", "mujoco", "control", "online", "world")
+
 
 @dataclass(frozen=True)
 class Control:

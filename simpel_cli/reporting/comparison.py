@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.evaluation.comparison import METRICS, Mean, Metric, best, by_seed, difference, points, variant
-from simpel_cli.reporting.figures.canvas import columns_of, distinct, with_interval
+from simpel_cli.reporting.figures.canvas import distinct, with_interval
 from simpel_cli.reporting.figures.compare import Course, draw_calibrations, draw_courses
 from simpel_cli.reporting.figures.sweep import draw_by_size
 from simpel_cli.reporting.html import figure
 from simpel_cli.reporting.tables import write_csv, write_latex
+from simpel_cli.runs.files import read_columns
 from simpel_cli.runs.finding import Found
 
 COURSES = {  # verb -> metric, its split, what it runs along, what it is called
@@ -182,7 +183,7 @@ class Comparison:
             path = run.found.directory / "calibration.parquet"
             if (run.rows[0]["n_train"] or 0) == size and path.is_file():
                 with contextlib.suppress(Exception):  # a damaged file costs its own line
-                    table = columns_of(path)
+                    table = read_columns(path)
                     joint = table["output"] == "joint"
                     gathered.setdefault(run.variant, []).append({c: table[c][joint] for c in ("level", "fraction")})
         if not gathered:

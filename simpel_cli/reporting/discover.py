@@ -8,10 +8,11 @@ import numpy as np
 from simpel_cli.config.resolved import dump, load
 from simpel_cli.discovery.verdict.undetectable import in_words
 from simpel_cli.reporting.discover_sections import HORIZONS, reliable, rows_of, sections_of, untested, words
-from simpel_cli.reporting.figures.canvas import columns_of, with_interval, with_unit
+from simpel_cli.reporting.figures.canvas import with_interval, with_unit
 from simpel_cli.reporting.html import write_report
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import typed
+from simpel_cli.runs.files import read_columns
 
 KINDS = {
     "effect": "An effect was found.",
@@ -70,7 +71,7 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     if small:
         more = len(good) - MOST_NAMED
         terminal.line(f"Not found, and smaller than: {small}" + (f" · {more} more in the report" if more > 0 else ""))
-    outside = untested(columns_of(directory / "coverage.parquet")) + in_words(found.get("not_tested", []))
+    outside = untested(read_columns(directory / "coverage.parquet")) + in_words(found.get("not_tested", []))
     if outside:
         terminal.line(f"Not tested by these data: {', '.join(outside)}")
     terminal.line(f"{found['candidates_tried']} candidates, {found['seconds']:.0f} s", "time")
@@ -80,7 +81,7 @@ def _table(found: dict[str, Any], directory: Path) -> str:
     """Errors before and after, for terminals."""
     both = bool(found["effects"])
     cells = [["", "", "before", *(["after", "reduction (95 %)"] if both else []), "noise floor"]]
-    for row in rows_of(columns_of(directory / "errors.parquet")):
+    for row in rows_of(read_columns(directory / "errors.parquet")):
         label = HORIZONS[row["horizon"]].format(steps=found["error"]["horizon_steps"])
         line = [label, with_unit(row["output"], row["unit"]), _number(row["before"])]
         if both:

@@ -11,8 +11,9 @@ import numpy as np
 from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
 from simpel_cli.discovery.verdict.remainder import dependence
 from simpel_cli.reporting.figures import draw_discover
-from simpel_cli.reporting.figures.canvas import columns_of, with_interval, with_unit
+from simpel_cli.reporting.figures.canvas import with_interval, with_unit
 from simpel_cli.reporting.html import figure
+from simpel_cli.runs.files import read_columns
 
 AT_REST = -20.0  # nats: a fit so far below the model that it contains has not come to rest, and its spread says nothing
 NEAR_RANGE = 0.95  # share of a declared range that counts as all of it
@@ -33,7 +34,7 @@ def sections_of(
         directory: of the run, with its tables.
     """
     tables = {
-        p.stem: columns_of(p) for p in directory.glob("*.parquet") if p.stem in ("errors", "parameters", "coverage")
+        p.stem: read_columns(p) for p in directory.glob("*.parquet") if p.stem in ("errors", "parameters", "coverage")
     }
     pictures = {p.stem: figure(p) for p in draw_discover(directory)}
     own, following = pictures.pop("parameters", {}), pictures.pop("next_experiment", {})

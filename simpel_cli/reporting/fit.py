@@ -5,19 +5,23 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.config.resolved import dump
 from simpel_cli.data import Recording
+from simpel_cli.data.summary import held_out_summary, split_summary
 from simpel_cli.evaluation import IN_DATA_UNITS, MIXED, joint_unit
 from simpel_cli.inference.prior_predictive import PriorCheck
 from simpel_cli.inference.protocols import Method
-from simpel_cli.reporting.data_summary import split_summary, test_summary
 from simpel_cli.reporting.figures import draw_run
 from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.reporting.prior_check import describe_prior
-from simpel_cli.reporting.run_table import named_method
+from simpel_cli.reporting.run_table import named_method, run_table
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed
+from simpel_cli.runs.manifest import Manifest
 from simpel_cli.studies.judgement import Judged
-from simpel_cli.studies.study import Fitted, Study
+from simpel_cli.studies.open import Study
+from simpel_cli.studies.prepare import Fitted
+from simpel_cli.studies.screen import Screen
 
 METRICS = {
     "nll": "NLL",
@@ -87,30 +91,29 @@ def _gap_text(study: Study, fitted: Fitted) -> str:
     return f"{what}: {words}, l {length:.3g}, kappa {scale}"
 
 
-def publish(
-    terminal: Terminal,
-    study: Study,
-    judged: Judged,
-    directory: Path,
-    config: str,
-    command: str,
-    run: dict[str, Any],
-    source: Path | None = None,
-) -> None:
+def describe_evaluation(terminal: Terminal, run: Path, step: int, study: Study, judged_on: Study) -> None:
+    """Say which fit is judged, and on what."""
+    terminal.line(f"simpel evaluate · {run} · step {step}", style="bold")
+    rows = held_out_summary(judged_on.recording)
+    what = f"the test split of the fit, {rows}" if judged_on is study else f"all of it, {rows}, new to the fit"
+    describe_data(terminal, judged_on.recording, what)
+
+
+def publish(terminal: Terminal, fit: Study, fitted: Fitted, study: Study, judged: Judged, manifest: Manifest) -> None:
     """Print the test results, draw the figures, write the report, and say where things lie and what to type next.
 
     Args:
         terminal: to print to.
+        fit: what was fitted.
+        fitted: its problems, as they were trained.
         study: what was judged, on its measurements.
         judged: the results.
-        directory: of the run.
-        config: the resolved configuration, as text.
-        command: verb.
-        run: table of how the results came about.
-        source: directory of the fit that was evaluated.
+        manifest: of the verb that runs.
     """
+    directory = manifest.directory
+    source = Path(manifest.facts["run"]) if manifest.command == "evaluate" else directory
     values = _by_metric(judged.rows)
-    tested = test_summary(study.recording)
+    tested = held_out_summary(study.recording)
     terminal.line()
     terminal.line(f"{f'test ({tested})':<20}{_headline(study, values)}")
     table = _table(study, values)
@@ -120,7 +123,7 @@ def publish(
         terminal.line(aligned(free["head"], free["rows"]))
     spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
-    next_commands = _next(study, directory, source)
+    next_commands = _next(study, source)
     what = "One step ahead" if study.system.encoding.states else "Predictions"
     tables = [table | {"title": f"{what}, held-out data", "note": NOTE}]
     if free is not None:
@@ -132,14 +135,15 @@ def publish(
         "text": True,
     }
     s = study.settings
+    figures = draw_run(directory) if s.figures else []
     report = write_report(
         directory / "report.html",
-        title=f"simpel {command} · {s.name} · {study.choices.get('method', '')}",
+        title=f"simpel {manifest.command} · {s.name} · {study.choices.get('method', '')}",
         lead=f"{study.system.source.name} on {study.recording.files[0].name}, tested on {tested}, seeds {s.all_seeds}. "
         f"Intervals are {spread}, resampling {judged.blocks}.",
-        sections=[*tables, run, checks, *(figure(path) for path in (draw_run(directory) if s.figures else []))],
+        sections=[*tables, run_table(fit, fitted, judged, manifest), checks, *map(figure, figures)],
         commands=next_commands,
-        config=config,
+        config=dump(fit.declared.config),
     )
     terminal.line(str(report), "report")
     terminal.next(next_commands)
@@ -217,7 +221,7 @@ def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
     return {"head": ("free run, RMSE", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
 
 
-def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
+def _next(study: Study, fit: Path) -> list[str]:
     """Return commands to go on with, as they can be typed where this one was."""
     chosen = study.choices
     own = f" --config-dir {typed(chosen['config_dir'])}" if chosen.get("config_dir") else ""
@@ -229,6 +233,9 @@ def _next(study: Study, directory: Path, source: Path | None) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {typed(source or directory)}          # with data=NAME: on all of a new file",
+        f"simpel evaluate {typed(fit)}          # with data=NAME: on all of a new file",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]
+
+
+SCREEN = Screen(describe, describe_evaluation, publish)

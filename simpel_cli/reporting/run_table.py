@@ -7,7 +7,8 @@ import numpy as np
 
 from simpel_cli.runs.manifest import Manifest, versions
 from simpel_cli.studies.judgement import Judged
-from simpel_cli.studies.study import Fitted, Study
+from simpel_cli.studies.open import Study
+from simpel_cli.studies.prepare import Fitted
 
 PHASES = (("compilation", "compile_seconds"), ("training", "train_seconds"))
 
@@ -21,7 +22,7 @@ def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) 
         judged: has the learned noise.
         manifest: of the verb that runs; `facts` may hold the seconds of compilation and training.
     """
-    used, seeds = len(fitted.training[0][0]), study.settings.all_seeds
+    used, seeds = fitted.n_train, study.settings.all_seeds
     software = {"python": platform.python_version()} | versions()
     rows = [
         ("method", _method(study)),

@@ -71,3 +71,21 @@ def read_table(path: Path) -> Any:
     import pyarrow.parquet as pq
 
     return pq.read_table(path, page_checksum_verification=True)
+
+
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """Read a Parquet file as arrays by column.
+
+    Raises:
+        OSError, pyarrow.ArrowException: it is missing or damaged.
+    """
+    table = read_table(path)
+    return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
+
+
+def read_units(path: Path) -> dict[str, str]:
+    """Read the units of columns from the metadata of a Parquet file's fields."""
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(path)
+    return {f.name: f.metadata[b"unit"].decode() for f in schema if f.metadata and b"unit" in f.metadata}

@@ -6,13 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.config.nodes import build
 from simpel_cli.data import transitions
+from simpel_cli.data.recording import Source
 from simpel_cli.inference import loop
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.metrics import write_metrics
+from simpel_cli.studies.declared import Declared
 from simpel_cli.studies.judgement import judge
-from simpel_cli.studies.study import STRETCH, open_study, posteriors, prepare
+from simpel_cli.studies.open import open_study
+from simpel_cli.studies.prepare import STRETCH, posteriors, prepare
+from simulators.model import Model
 
 SIZES = (20, 50)  # training transitions
 SEEDS = 5
@@ -21,22 +24,19 @@ SHOWN = ("nll", "nrmse")  # joint, beside the free runs
 Summary = dict[str, dict[str, dict[str, list[float]]]]
 
 
-def memory_of(sim: dict[str, Any]) -> int:
-    """Return the number of past inputs that a transition of a declared simulator needs."""
-    past: int = build(sim, "sim").model().past()
-    return past
+def past_inputs(source: Source) -> int:
+    """Return the number of past inputs that a transition of a simulator needs."""
+    return source.past() if isinstance(source, Model) else 0
 
 
-def close(
-    config: dict[str, Any], corrected: dict[str, Any], directory: Path, data_folder: Path, terminal: Terminal
-) -> Summary:
+def close(declared: Declared, corrected: Declared, directory: Path, data_folder: Path, terminal: Terminal) -> Summary:
     """Fit SimPEL with both simulators and judge both on the test episodes; writes `metrics.parquet`.
 
     Both get the same transitions, past inputs, method and seeds.
 
     Args:
-        config: of the search, resolved.
-        corrected: the `sim:` node of the corrected simulator.
+        declared: configuration of the search.
+        corrected: the same with the corrected simulator.
         directory: of the run; each fit's tables go below `close/`.
         data_folder: folder of the data YAML.
         terminal: for a line per fit.
@@ -44,17 +44,15 @@ def close(
     Returns:
         before|after -> training transitions -> metric -> [median, smallest, largest] over seeds.
     """
-    stack = max(memory_of(corrected), memory_of(config["sim"]), int(config["data"].get("stack_actions") or 0))
-    own_run = {**(config.get("run") or {}), "precision": "float32", "seeds": SEEDS, "quiet": True}
+    both = {"before": declared, "after": corrected}
+    stack = max(declared.measurements.stack_actions, *(past_inputs(one.source) for one in both.values()))
+    own_run = {**(declared.config.get("run") or {}), "precision": "float32", "seeds": SEEDS, "quiet": True}
     rows: list[dict[str, Any]] = []
     found: Summary = {"before": {}, "after": {}}
     for n in SIZES:
         began = perf_counter()
-        data = config["data"] | {"n_train": n, "stack_actions": stack}
-        sims = {"before": config["sim"], "after": corrected}
-        studies = {
-            k: open_study(config | {"sim": v, "data": data, "run": own_run}, data_folder) for k, v in sims.items()
-        }
+        data = declared.config["data"] | {"n_train": n, "stack_actions": stack}
+        studies = {k: open_study(one.changed(run=own_run, data=data), data_folder) for k, one in both.items()}
         if len(transitions(studies["before"].recording.train, stack).row) < n:
             break
         for label, study in studies.items():
@@ -68,7 +66,7 @@ def close(
             same = study.constants | {"run": directory.name, "command": "discover", "n_train": n}
             rows += [same | row for row in judged.rows]
             found[label][str(n)] = _summary(judged.rows)
-        compared = _compared(*(found[label][str(n)] for label in sims))
+        compared = _compared(*(found[label][str(n)] for label in both))
         terminal.line(f"{n} transitions, {SEEDS} seeds: {compared} ({perf_counter() - began:.0f} s)", "prior")
     write_metrics(directory / "metrics.parquet", rows, {})
     return found

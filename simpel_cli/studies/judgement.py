@@ -10,7 +10,7 @@ from simpel_cli import evaluation as ev
 from simpel_cli.data import Episode, Places, origins, places, transitions
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.runs.files import write_table
-from simpel_cli.studies.study import Study, refuse_untested
+from simpel_cli.studies.open import Study, refuse_untested
 
 MOST_RUNS = 100  # free runs whose course is kept
 

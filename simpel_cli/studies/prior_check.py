@@ -5,7 +5,8 @@ import numpy as np
 
 from simpel_cli.inference.prior_predictive import PriorCheck, check_prior
 from simpel_cli.runs.settings import stream
-from simpel_cli.studies.study import Fitted, Study
+from simpel_cli.studies.open import Study
+from simpel_cli.studies.prepare import Fitted
 
 
 def prior_check(study: Study, fitted: Fitted) -> PriorCheck | None:

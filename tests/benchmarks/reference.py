@@ -21,7 +21,7 @@ from simpel_cli.evaluation import Posterior, one_step
 from simpel_cli.inference import loop
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.settings import Settings, configure
-from simpel_cli.studies.study import STRETCH
+from simpel_cli.studies.prepare import STRETCH
 from tests.benchmarks.arrays import METHODS, SCORES, Case, case, folder, sets
 
 KEYS = ("nll", "rmse", "crps", "coverage_90")

@@ -25,7 +25,9 @@ from simpel_cli.inference.assemble import assemble
 from simpel_cli.reporting.figures.canvas import COLOURS, new_figure, save
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.settings import stream
-from simpel_cli.studies.study import STRETCH, Fitted, Study, open_study, prepare, resolved
+from simpel_cli.studies.declared import declare, resolved
+from simpel_cli.studies.open import Study, open_study
+from simpel_cli.studies.prepare import STRETCH, Fitted, prepare
 
 MOST_TESTED = 64  # inputs at which the posterior is looked at
 
@@ -132,7 +134,7 @@ def main() -> None:
     options = parser.parse_args()
 
     def task(job: Job) -> None:
-        study = open_study(resolved(job), job.data_folder)
+        study = open_study(declare(resolved(job)), job.data_folder)
         fitted = prepare(study)
         given = drawn(study, fitted, options.replicas)
         h = particles(study, fitted, given)

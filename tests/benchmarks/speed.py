@@ -74,7 +74,7 @@ def measured(given: dict[str, Any], stretches: int, started: float) -> dict[str,
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from simpel_cli.inference import loop
     from simpel_cli.runs.settings import Settings, configure
-    from simpel_cli.studies.study import STRETCH
+    from simpel_cli.studies.prepare import STRETCH
     from tests.benchmarks.arrays import case
 
     configure(Settings())

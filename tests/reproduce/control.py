@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from simpel_cli.reporting.figures.canvas import columns_of, legend_below, line_style, new_figure, save
-from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.reporting.figures.canvas import legend_below, line_style, new_figure, save
+from simpel_cli.runs.files import read_columns, write_table, write_text
 from tests.reproduce.panel import CONF, Fit, run, tested, verdict
 from tests.reproduce.static import folder
 
@@ -140,7 +140,7 @@ def online(every: Sequence[Fit], out: Path) -> list[str]:
         files = sorted((out / fit.name / "episodes").glob("*.parquet"))
         if not (out / fit.name / "report.html").exists():
             continue
-        tables = [columns_of(path) for path in files]
+        tables = [read_columns(path) for path in files]
         returns = np.array([t["reward"].sum() for t in tables])
         near = np.array([np.hypot(t["x"], t["y"]).min() for t in tables])
         courses.setdefault(fit.method, []).append(returns)

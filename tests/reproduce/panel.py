@@ -4,7 +4,6 @@ A fit is what `simpel fit` does with the words of the job; its directory keeps t
 """
 
 import argparse
-import importlib
 import itertools
 import multiprocessing
 import os
@@ -24,6 +23,7 @@ from simpel_cli.reporting.figures.canvas import legend_below, line_style, new_fi
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import read_manifest
 from simpel_cli.runs.metrics import read_metrics
+from simpel_cli.sweeps.verbs import STARTS as VERBS
 
 CONF = Path(__file__).parent / "conf"
 METRICS = ("nll", "nll_sum", "nrmse")
@@ -172,9 +172,6 @@ def _fit_all(fits: Sequence[Fit], out: Path) -> list[tuple[str, str]]:
 
 
 def _fit(fit: Fit, directory: Path) -> str:
-    task = getattr(
-        importlib.import_module(f"simpel_cli.commands.{fit.verb.replace('-', '_')}"), fit.verb.replace("-", "_")
-    )
     began = time.perf_counter()
     for number in itertools.count():  # what a kill left behind stays for whoever wants to look at it
         if not directory.exists():
@@ -183,7 +180,7 @@ def _fit(fit: Fit, directory: Path) -> str:
             directory.rename(old)
     words = [*fit.words, f"hydra.run.dir={directory}", "run.figures=false", "run.quiet=true"]
     try:
-        launch(fit.verb, task, words, config_dir=fit.conf, flags=[])
+        launch(fit.verb, VERBS[fit.verb], words, config_dir=fit.conf, flags=[])
     except Exception as error:  # whatever it is, it costs this fit and no other
         return f"failed: {error!r}"
     write_text(directory / WORDS, "\n".join(fit.words) + "\n")

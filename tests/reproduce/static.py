@@ -20,7 +20,7 @@ from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.settings import Settings, configure, stream
-from simpel_cli.studies.study import STRETCH
+from simpel_cli.studies.prepare import STRETCH
 
 SEEDS = 5
 DRAWS = 256

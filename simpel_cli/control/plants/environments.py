@@ -1,4 +1,4 @@
-"""Rigs that are stepped: a MuJoCo world, and anything that gymnasium makes."""
+"""Environments that are stepped: a MuJoCo world, and anything that gymnasium makes."""
 
 import importlib
 from typing import Any
@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from simpel_cli.control.compatibility import check_comparable
+from simpel_cli.control.compatibility import check_compatible
 from simpel_cli.control.task import Goal
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simulators.worlds.world import World
 
 
-class WorldRig:
+class WorldEnvironment:
     """A world with query access, with noisy sensors. States that the simulator does not have begin at 0.
 
     Args:
@@ -32,7 +32,7 @@ class WorldRig:
     def __init__(
         self, world: World, encoding: Encoding, goal: Goal, dt: float, noise_std: np.ndarray, key: PRNGKeyArray
     ) -> None:
-        check_comparable("mujoco", world, encoding, goal, dt, by_name=True)
+        check_compatible("mujoco", world, encoding, goal, dt, by_name=True)
         self.world, self.goal, self.noise_std, self.key = world, goal, noise_std, key
         self.columns = [[q.name for q in world.states].index(q.name) for q in encoding.states]
         self.order = [[q.name for q in encoding.inputs].index(q.name) for q in world.inputs]
@@ -40,7 +40,7 @@ class WorldRig:
         self.state, self.rng = np.zeros(len(world.states)), np.random.default_rng()
 
     def reset(self, number: int) -> np.ndarray:
-        """Begin an episode; see `Rig`."""
+        """Begin an episode; see `Environment`."""
         key = jax.random.fold_in(self.key, number)
         self.rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         self.state = np.zeros(len(self.world.states))
@@ -48,7 +48,7 @@ class WorldRig:
         return self._measured()
 
     def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Apply a command; see `Rig`."""
+        """Apply a command; see `Environment`."""
         self.state = self.world.step(self.state[None], command[self.order][None], self.phi)[0]
         return self._measured(), self.state[self.columns].copy(), False
 
@@ -56,7 +56,7 @@ class WorldRig:
         return self.state[self.columns] + self.noise_std * self.rng.standard_normal(len(self.columns))
 
 
-class GymnasiumRig:
+class GymnasiumEnvironment:
     """An environment of gymnasium's protocol. What it observes are the states: a mapping by name, or an array in their order.
 
     Its own reward is not looked at: the task has one.
@@ -84,11 +84,11 @@ class GymnasiumRig:
             raise ConfigError(f"world: gymnasium cannot make {name!r}: {error}") from error
 
     def reset(self, number: int) -> np.ndarray:
-        """Begin an episode; see `Rig`."""
+        """Begin an episode; see `Environment`."""
         return self._states(self.environment.reset(seed=self.seed * 1000 + number)[0])
 
     def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Apply a command; see `Rig`."""
+        """Apply a command; see `Environment`."""
         seen, _, terminated, truncated, *_ = self.environment.step(command.astype(np.float32))
         states = self._states(seen)
         return states, states, bool(terminated or truncated)

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.control.plants.plant import Ride
-from simpel_cli.control.plants.returned_episodes import POLL, Answers
+from simpel_cli.control.plants.plant import PlantEpisode
+from simpel_cli.control.plants.returned_episodes import POLL, ReturnedEpisodes
 from simpel_cli.errors import DataError
 from simpel_cli.runs.files import write_text
 
@@ -26,7 +26,7 @@ class Exchange:
 
     Args:
         folder: made if missing.
-        answers: reads what comes back.
+        returned: reads what comes back.
         wait: s, for an answer, until it gives up.
         run: whose exchange this is: an answer that another run asked for is none.
         accept: raises DataError of an episode, by its number, that a fit could not read.
@@ -37,17 +37,17 @@ class Exchange:
     def __init__(
         self,
         folder: Path,
-        answers: Answers,
+        returned: ReturnedEpisodes,
         wait: float,
         run: str,
-        accept: Callable[[int, Ride], None],
+        accept: Callable[[int, PlantEpisode], None],
         say: Callable[[str], None],
         check: Callable[[], None],
     ) -> None:
-        self.folder, self.answers = folder, answers
+        self.folder, self.returned = folder, returned
         self.wait, self.run, self.accept, self.say, self.check = wait, run, accept, say, check
 
-    def ride(self, number: int, policy: Path) -> Ride:
+    def episode(self, number: int, policy: Path) -> PlantEpisode:
         """Hand out the policy and wait for the episode; see `Plant`.
 
         Raises:
@@ -55,7 +55,7 @@ class Exchange:
         """
         name = f"episode_{number:03d}"
         answer, asked = self.folder / f"{name}.parquet", self.folder / name / "request.json"
-        request = {"format": "simpel episode 1", "run": self.run, "answer": answer.name} | self.answers.asked
+        request = {"format": "simpel episode 1", "run": self.run, "answer": answer.name} | self.returned.asked
         if (found := _read_request(asked)) != request:
             if answer.exists():
                 raise DataError(
@@ -80,10 +80,10 @@ class Exchange:
                         "a folder of its own, and go on with --resume."
                     )
                 try:
-                    ride = self.answers.read(answer)
-                    self.accept(number, ride)
-                    self.answers.remark(answer, ride, policy)
-                    return ride
+                    episode = self.returned.read(answer)
+                    self.accept(number, episode)
+                    self.returned.remark(answer, episode, policy)
+                    return episode
                 except DataError as error:
                     self._refuse(answer, str(error))
                     end = time.monotonic() + self.wait

@@ -22,7 +22,7 @@ from simpel_cli.runs.files import write_table
 LEAST_ROWS = 2  # of an episode: one transition
 
 
-class Ride(NamedTuple):
+class PlantEpisode(NamedTuple):
     """One episode as it was measured, physical units.
 
     Args:
@@ -42,7 +42,7 @@ class Ride(NamedTuple):
 class Plant(Protocol):
     """Whatever a policy drives."""
 
-    def ride(self, number: int, policy: Path) -> Ride:
+    def episode(self, number: int, policy: Path) -> PlantEpisode:
         """Drive one episode.
 
         Args:
@@ -56,7 +56,7 @@ class Plant(Protocol):
 
 
 @runtime_checkable
-class Rig(Protocol):
+class Environment(Protocol):
     """A plant that is stepped, physical units."""
 
     def reset(self, number: int) -> np.ndarray:
@@ -124,7 +124,7 @@ class Simulated:
 
         self._run = jax.jit(one)
 
-    def ride(self, number: int, policy: Path) -> Ride:
+    def episode(self, number: int, policy: Path) -> PlantEpisode:
         """Drive one episode; see `Plant`. It ends where the simulator could not go on."""
         found = self._run(load_policy(policy)[0], jax.random.fold_in(self.key, number))
         found = jax.tree.map(lambda a: np.asarray(a)[:, 0] if a.ndim > 1 else np.asarray(a), found)
@@ -134,32 +134,32 @@ class Simulated:
             raise DataError(f"episode {number}: no step was possible; the simulator gave no finite state at once.")
         states = np.asarray(self.encoding.decode(jnp.asarray(found.seen[:, : self.encoding.dim_state])))
         commands = np.asarray(self.goal.command(jnp.asarray(found.action)))
-        return Ride(states[: steps + 1], commands[:steps], found.reward[:steps], found.good[:steps])
+        return PlantEpisode(states[: steps + 1], commands[:steps], found.reward[:steps], found.good[:steps])
 
 
 class Stepped:
-    """A rig that is stepped, driven by the runner that needs numpy only.
+    """An environment that is stepped, driven by the runner that needs numpy only.
 
     Args:
-        rig: what is stepped.
+        environment: what is stepped.
         encoding: names of states.
         goal: of the task.
         horizon: steps of an episode.
     """
 
-    def __init__(self, rig: Rig, encoding: Encoding, goal: Goal, horizon: int) -> None:
-        self.rig, self.encoding, self.goal, self.horizon = rig, encoding, goal, horizon
+    def __init__(self, environment: Environment, encoding: Encoding, goal: Goal, horizon: int) -> None:
+        self.environment, self.encoding, self.goal, self.horizon = environment, encoding, goal, horizon
 
-    def ride(self, number: int, policy: Path) -> Ride:
+    def episode(self, number: int, policy: Path) -> PlantEpisode:
         """Drive one episode; see `Plant`. It ends where a state is not finite."""
         runner, names = PolicyRunner(policy), [q.name for q in self.encoding.states]
-        measured, true, commands = [np.asarray(self.rig.reset(number), float)], [], []
+        measured, true, commands = [np.asarray(self.environment.reset(number), float)], [], []
         for _ in range(self.horizon):
             if not np.isfinite(measured[-1]).all():
                 break
             given = runner.command(dict(zip(names, measured[-1].tolist(), strict=True)))
             command = np.array([given[q.name] for q in self.encoding.inputs])
-            seen, state, ended = self.rig.step(command)
+            seen, state, ended = self.environment.step(command)
             if not (np.isfinite(seen).all() and np.isfinite(state).all()):
                 break
             commands.append(command)
@@ -171,21 +171,24 @@ class Stepped:
         if not commands:
             raise DataError(f"episode {number}: no step was possible; a state was not finite at once: {measured[0]}.")
         reward, good, _ = earned(self.goal, self.encoding, np.array(true), np.array(commands))
-        return Ride(np.array(measured), np.array(commands), reward, good)
+        return PlantEpisode(np.array(measured), np.array(commands), reward, good)
 
 
-def write_ride(path: Path, ride: Ride, encoding: Encoding, dt: float) -> None:
+def write_episode(path: Path, episode: PlantEpisode, encoding: Encoding, dt: float) -> None:
     """Write an episode as measurements; of the last row, whose command nobody saw, the command is repeated.
 
     Args:
         path: of the Parquet file.
-        ride: the episode.
+        episode: the episode.
         encoding: names and units.
         dt: s, between rows.
     """
-    held = np.concatenate([ride.commands, ride.commands[-1:]])
-    columns: dict[str, Any] = {"t": np.arange(len(ride.states)) * dt}
-    columns |= {q.name: ride.states[:, i].astype(float) for i, q in enumerate(encoding.states)}
+    held = np.concatenate([episode.commands, episode.commands[-1:]])
+    columns: dict[str, Any] = {"t": np.arange(len(episode.states)) * dt}
+    columns |= {q.name: episode.states[:, i].astype(float) for i, q in enumerate(encoding.states)}
     columns |= {q.name: held[:, i].astype(float) for i, q in enumerate(encoding.inputs)}
-    columns |= {"reward": np.append(ride.reward, 0.0).astype(float), "good": np.append(ride.good, ride.good[-1])}
+    columns |= {
+        "reward": np.append(episode.reward, 0.0).astype(float),
+        "good": np.append(episode.good, episode.good[-1]),
+    }
     write_table(path, columns, {"t": "s"} | {q.name: q.unit for q in (*encoding.states, *encoding.inputs)})

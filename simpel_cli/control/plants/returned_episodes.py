@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.control.plants.plant import LEAST_ROWS, Ride, earned
+from simpel_cli.control.plants.plant import LEAST_ROWS, PlantEpisode, earned
 from simpel_cli.control.plants.runner import PolicyRunner
 from simpel_cli.control.task import Goal, Task
 from simpel_cli.dynamics.encoding import Encoding
@@ -21,7 +21,7 @@ FAR, ODD = 10.0, 1.0  # widths of a state's range beyond it: no measurement, and
 APART = 0.1  # of a command's range, on average: commands are not the policy's
 
 
-class Answers:
+class ReturnedEpisodes:
     """Reads episodes.
 
     Args:
@@ -42,7 +42,7 @@ class Answers:
         initial = {q.name: self.task.initial.get(q.name, 0.0) for q in self.encoding.states}
         return {"rows": self.horizon + 1, "dt": self.dt, "initial": initial}
 
-    def read(self, path: Path) -> Ride:
+    def read(self, path: Path) -> PlantEpisode:
         """Read an episode.
 
         Raises:
@@ -74,7 +74,7 @@ class Answers:
         last = int(np.argmax(over)) + 1 if over.any() else len(reward)
         if last < self.horizon and not over.any():
             self.say(f"{path.name} has {rows} rows of {self.horizon + 1}: taken as an episode that was cut short")
-        return Ride(states[: last + 1], commands[:last], reward[:last], good[:last])
+        return PlantEpisode(states[: last + 1], commands[:last], reward[:last], good[:last])
 
     def _within(self, path: Path, quantity: Quantity, values: np.ndarray) -> None:
         """Compare a state with its declared range: a spike of a sensor would be the end of every fit to come."""
@@ -91,20 +91,20 @@ class Answers:
         if beyond[row] > ODD:
             self.say(f"{told}: a spike of the sensor would spoil the model")
 
-    def remark(self, path: Path, ride: Ride, policy: Path) -> None:
+    def remark(self, path: Path, episode: PlantEpisode, policy: Path) -> None:
         """Say what is odd about an episode."""
-        for q, value in zip(self.encoding.states, ride.states[0], strict=True):
+        for q, value in zip(self.encoding.states, episode.states[0], strict=True):
             low, high = self.task.begins(q.name)
             if not q.periodic and not low <= value <= high:
                 self.say(f"{path.name} begins at {q.name} = {value:.4g} {q.unit}; the task does in {low:g} to {high:g}")
         runner = PolicyRunner(policy)
         names = [q.name for q in self.encoding.states]
         given = []
-        for state, command in zip(ride.states, ride.commands, strict=False):
+        for state, command in zip(episode.states, episode.commands, strict=False):
             own = runner.command(dict(zip(names, state.tolist(), strict=True)))
             given.append([own[q.name] for q in self.encoding.inputs])
             runner.past = [*runner.past[1:], command] if runner.past else []
-        apart = np.mean(np.abs(np.array(given) - ride.commands), axis=0) / (runner.high - runner.low)
+        apart = np.mean(np.abs(np.array(given) - episode.commands), axis=0) / (runner.high - runner.low)
         for q, share in zip(self.encoding.inputs, apart, strict=True):
             if share > APART:
                 self.say(

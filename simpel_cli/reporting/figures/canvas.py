@@ -1,4 +1,4 @@
-"""What every figure shares: axes without global state, colours, legends beside the curves, reading and saving."""
+"""What every figure shares: axes without global state, colours, legends beside the curves, saving."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.runs.files import read_table, replacing
+from simpel_cli.runs.files import replacing
 
 # colour-blind safe (Okabe and Ito 2008)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -79,20 +79,6 @@ def save(figure: Any, path: Path) -> Path:
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
     return path
-
-
-def columns_of(path: Path) -> dict[str, np.ndarray]:
-    """Read a Parquet file as arrays by column."""
-    table = read_table(path)
-    return {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-
-
-def units_of(path: Path) -> dict[str, str]:
-    """Read the units of columns from the metadata of a Parquet file's fields."""
-    import pyarrow.parquet as pq
-
-    schema = pq.read_schema(path)
-    return {f.name: f.metadata[b"unit"].decode() for f in schema if f.metadata and b"unit" in f.metadata}
 
 
 def distinct(values: Iterable[Any]) -> list[Any]:

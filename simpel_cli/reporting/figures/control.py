@@ -9,15 +9,13 @@ from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
     DASHES,
-    columns_of,
     distinct,
     legend_below,
     new_figure,
     save,
-    units_of,
     with_unit,
 )
-from simpel_cli.runs.files import replacing
+from simpel_cli.runs.files import read_columns, read_units, replacing
 from simpel_cli.runs.metrics import read_metrics
 
 SHOWN = 20  # paths of episodes
@@ -33,7 +31,7 @@ def draw_control(directory: Path) -> list[Path]:
         made.append(save(_curves(rows), directory / "learning_curves.png"))
     path = directory / "episodes.parquet"
     if path.exists():
-        table, units = columns_of(path), units_of(path)
+        table, units = read_columns(path), read_units(path)
         made.append(save(_paths(table, units), directory / "trajectories.png"))
         if {"x", "y", "theta"} <= set(table):
             made.append(_film(_median(table), units, directory / "manoeuvre.gif"))
@@ -44,11 +42,11 @@ def draw_online(directory: Path) -> list[Path]:
     """Draw what the Parquet files of an online run tell: returns by episode, paths of the episodes, the last as a film."""
     made = [save(_returns(read_metrics(directory / "metrics.parquet")), directory / "returns.png")]
     files = sorted((directory / "episodes").glob("*.parquet"))
-    tables = [columns_of(path) for path in files]
-    made.append(save(_courses(tables, units_of(files[0])), directory / "trajectories.png"))
+    tables = [read_columns(path) for path in files]
+    made.append(save(_courses(tables, read_units(files[0])), directory / "trajectories.png"))
     if {"x", "y", "theta"} <= set(tables[-1]):
         last = tables[-1] | {"step": np.arange(len(tables[-1]["x"]))}
-        made.append(_film(last, units_of(files[-1]), directory / "manoeuvre.gif"))
+        made.append(_film(last, read_units(files[-1]), directory / "manoeuvre.gif"))
     return made
 
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, TIE
-from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, columns_of, distinct, new_figure, with_interval
+from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, distinct, new_figure, with_interval
+from simpel_cli.runs.files import read_columns
 
 LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge
 LINEAR = 10.0  # nats up to which the axis is linear; logarithmic beyond
@@ -17,7 +18,7 @@ NAMELESS: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "0.55", "hatch": "/
 
 def draw_evidence(found: dict[str, Any], path: Path) -> Any:
     """Draw, per step, what each candidate would add to the evidence, the accepted one and those it ties with."""
-    table = columns_of(path)
+    table = read_columns(path)
     if not table:
         return None
     steps = distinct(table["step"].tolist())
@@ -131,7 +132,7 @@ def _bracket(axis: Any, own: dict[str, np.ndarray], shown: list[int], accepted: 
 
 def draw_parameters(found: dict[str, Any], path: Path) -> Any:
     """Draw parameters with 90 % intervals, before and after, in their declared ranges."""
-    table = columns_of(path)
+    table = read_columns(path)
     if not found["effects"]:
         table = {name: column[table["model"] == "before"] for name, column in table.items()}
     if not table or not len(table["parameter"]):

@@ -8,13 +8,12 @@ import numpy as np
 from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
-    columns_of,
     distinct,
     legend_below,
     new_figure,
-    units_of,
     with_unit,
 )
+from simpel_cli.runs.files import read_columns, read_units
 
 BINS = 14
 LEAST = 6  # rows of a bin
@@ -52,7 +51,7 @@ def strength(b: Bins) -> float:
 
 def draw_residual(found: dict[str, Any], path: Path) -> Any:
     """Draw the latent force against each state and input, of the simulator before and after."""
-    table, units = columns_of(path), units_of(path)
+    table, units = read_columns(path), read_units(path)
     panels = _panels(table)
     figure, axes = new_figure(len(panels), 3.4, 2.9, columns=3)
     for axis, (acts_on, argument) in zip(axes, panels, strict=True):
@@ -90,7 +89,7 @@ def draw_effects(found: dict[str, Any], residuals: Path, curves: Path) -> Any:
     Points are the latent force with the corrected parameters and the effects switched off, less what the effects on other
     arguments do: a partial residual (Larsen and McCleary 1972).
     """
-    table, units, curve = columns_of(residuals), units_of(residuals), columns_of(curves)
+    table, units, curve = read_columns(residuals), read_units(residuals), read_columns(curves)
     table = {name: column[table["model"] == "without"] for name, column in table.items()}
     if not len(table["force"]) or not found["effects"]:
         return None

@@ -9,13 +9,13 @@ from simpel_cli.discovery.likelihood.whiteness import autocorrelation, cumulated
 from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
-    columns_of,
     distinct,
     legend_below,
     new_figure,
     ratio_scale,
     with_unit,
 )
+from simpel_cli.runs.files import read_columns
 
 STYLE = {"before": (COLOURS[1], "calibrated simulator", "--"), "after": (COLOURS[0], "corrected simulator", "-")}
 HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "free run"}
@@ -28,7 +28,7 @@ def models_of(found: dict[str, Any]) -> tuple[str, ...]:
 
 def draw_traces(found: dict[str, Any], path: Path) -> Any:
     """Draw measured values and free runs of the test episode whose error after is the median of all."""
-    table = columns_of(path)
+    table = read_columns(path)
     if not len(table["episode"]):
         return None
     episode = typical_episode(table)
@@ -73,7 +73,7 @@ def _around(axis: Any, own: dict[str, np.ndarray], models: tuple[str, ...]) -> N
 
 def draw_whiteness(found: dict[str, Any], path: Path) -> Any:
     """Draw autocorrelation and cumulated periodogram of the standardised one-step errors on test episodes."""
-    table = columns_of(path)
+    table = read_columns(path)
     outputs, models = distinct(table["output"]), models_of(found)
     figure, axes = new_figure(2 * len(outputs), 4.6, 2.5, columns=2)
     for k, output in enumerate(outputs):
@@ -112,7 +112,7 @@ def _trimmed(e: np.ndarray) -> np.ndarray:
 
 def draw_errors(found: dict[str, Any], path: Path) -> Any:
     """Draw RMSE before and after by horizon with 95 % intervals, and the noise below which no error can fall."""
-    table = columns_of(path)
+    table = read_columns(path)
     outputs, models = distinct(table["output"]), models_of(found)
     figure, axes = new_figure(len(outputs), 3.6, 2.8, columns=3)
     steps = found["error"]["horizon_steps"]

@@ -10,7 +10,6 @@ import numpy as np
 from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,
-    columns_of,
     distinct,
     legend_below,
     legend_beside,
@@ -19,6 +18,7 @@ from simpel_cli.reporting.figures.canvas import (
     save,
     with_unit,
 )
+from simpel_cli.runs.files import read_columns
 from simpel_cli.runs.metrics import read_metrics
 
 MOST_POINTS = 200  # of a panel: more of them is a band of ink
@@ -45,7 +45,7 @@ def draw_run(directory: Path) -> list[Path]:
 
 def _prior_predictive(path: Path) -> Any:
     """Training targets among draws of the simulator, in the order of the draws' medians."""
-    table = columns_of(path)
+    table = read_columns(path)
     outputs = distinct(table["output"])
     figure, axes = new_figure(len(outputs))
     for axis, output in zip(axes, outputs, strict=True):
@@ -112,7 +112,7 @@ def _of_seeds(first: int, seeds: Collection[int]) -> str:
 
 def _predictions(path: Path) -> Any:
     """Measured and predicted targets of the first seed: along the longest test segment, or against each other."""
-    table = columns_of(path)
+    table = read_columns(path)
     first = table["seed"] == table["seed"][0]
     pieces = Counter(zip(table["episode"][first], table["segment"][first], strict=True))
     (episode, segment), _ = pieces.most_common(1)[0]
@@ -156,7 +156,7 @@ def _against_each_other(axis: Any, shown: dict[str, np.ndarray], label: str) -> 
 
 
 def _calibration(path: Path) -> Any:
-    table = columns_of(path)
+    table = read_columns(path)
     outputs = distinct(table["output"])
     figure, (axis,) = new_figure(1, 3.6, 3.4, beside=len(outputs))
     axis.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--")
@@ -179,7 +179,7 @@ def _calibration(path: Path) -> Any:
 
 
 def _horizon(path: Path) -> Any:
-    table = columns_of(path)
+    table = read_columns(path)
     outputs, seeds = distinct(table["output"]), distinct(table["seed"].tolist())
     figure, axes = new_figure(len(outputs))
     for axis, output in zip(axes, outputs, strict=True):
@@ -199,7 +199,7 @@ def _horizon(path: Path) -> Any:
 
 def _example(path: Path) -> Any:
     """Measured and predicted course of the first seed's free run whose error is the median of all."""
-    table = columns_of(path)
+    table = read_columns(path)
     table = {name: column[table["seed"] == table["seed"][0]] for name, column in table.items()}
     runs = list(zip(table["episode"], table["segment"], table["start"], strict=True))
     typical = _median_run(runs, table)

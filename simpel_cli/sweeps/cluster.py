@@ -23,9 +23,9 @@ import dask
 import dask.utils
 from distributed import Client, LocalCluster, WorkerPlugin
 
-from simpel_cli.commands.job import Outcome, perform
 from simpel_cli.config.launch import Job
 from simpel_cli.errors import ConfigError, did_you_mean
+from simpel_cli.sweeps.job import Outcome, perform
 
 MEMORY_EACH = 2.5e9  # bytes of a job, about
 PATIENCE = 15.0  # s for a scheduler to answer, and for a worker of its to appear
@@ -267,7 +267,7 @@ def _stop(token: str) -> None:
 
 def _look(path: str) -> tuple[str, bool]:
     """Return a worker's version of simpel, and whether it sees a file."""
-    import simpel_cli.commands.job  # noqa: F401
+    import simpel_cli.sweeps.job  # noqa: F401
 
     return metadata.version("simpel"), Path(path).exists()
 

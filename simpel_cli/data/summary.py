@@ -19,7 +19,7 @@ def split_summary(recording: Recording) -> str:
     return text
 
 
-def test_summary(recording: Recording) -> str:
+def held_out_summary(recording: Recording) -> str:
     """Return e.g. `3 episodes` or `1 episode in 4 segments`."""
     if _stand_alone(recording):
         return _counted(_rows(recording.test), "row")

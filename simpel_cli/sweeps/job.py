@@ -1,10 +1,8 @@
 """One job of a sweep, whatever its verb: run it here, or go on with it where it was, and note how it ended."""
 
-import importlib
 import shutil
 import threading
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
@@ -18,14 +16,8 @@ from simpel_cli.runs.finding import ASIDE
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.lock import is_locked
 from simpel_cli.runs.manifest import read_manifest
+from simpel_cli.sweeps.verbs import RESUMES, STARTS
 
-# verb -> module and function; imported where a job runs
-STARTS = {
-    "fit": ("fit", "fit"),
-    "discover": ("discover", "discover"),
-    "rl-offline": ("rl_offline", "rl_offline"),
-    "rl-online": ("rl_online", "rl_online"),
-}
 _one_at_a_time = threading.Lock()  # settings of JAX are those of the process
 
 
@@ -75,7 +67,10 @@ def perform(job: Job, stop: threading.Event | None = None) -> Outcome:
             if (before := complete(job)) is not None:
                 return before
             resumed = _begun(job)
-            _runner(job.verb, resumed)(job.directory if resumed else job)
+            if resumed:
+                RESUMES[job.verb](job.directory)
+            else:
+                STARTS[job.verb](job)
     except SimpelError as failure:
         code, error = failure.exit_code, str(failure)
     except KeyboardInterrupt:
@@ -113,14 +108,9 @@ def _set_aside(directory: Path) -> None:
             path.rename(aside / path.name)
 
 
-def _runner(verb: str, resumed: bool) -> Callable[[Any], None]:
-    module, function = STARTS[verb]
-    return getattr(importlib.import_module(f"simpel_cli.commands.{module}"), "resume" if resumed else function)
-
-
 def _changed(job: Job) -> str:
     """Return what the configuration in the directory has otherwise than the job; empty: nothing that changes a result."""
-    from simpel_cli.studies.study import resolved
+    from simpel_cli.studies.declared import resolved
 
     own = {"quiet", "cache", "device"}
     if job.verb == "discover":

@@ -1,4 +1,4 @@
-"""Training of policies in the posteriors of a fit: shared by `rl-offline` and `rl-online`."""
+"""Training of policies in the posteriors of a fit."""
 
 import time
 from collections.abc import Callable
@@ -10,63 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from simpel_cli.commands.fit import Learned
-from simpel_cli.config.nodes import build
 from simpel_cli.control.agents.fine_tune import fine_tuned
-from simpel_cli.control.agents.planner import ICEM
 from simpel_cli.control.agents.policy import Policy
 from simpel_cli.control.agents.rollout import Episodes, episodes, reflex
-from simpel_cli.control.agents.sac import SAC, Rule
-from simpel_cli.control.compatibility import check_comparable
-from simpel_cli.control.settings import Control
-from simpel_cli.control.task import Goal, Task
-from simpel_cli.control.world import World, beginning_at, learned_world, true_world
-from simpel_cli.data.recording import Source
-from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.dynamics.transition import encoding_of, transition
-from simpel_cli.errors import ConfigError
+from simpel_cli.control.agents.sac import Rule
+from simpel_cli.control.assignment import Assignment
+from simpel_cli.control.posterior_world import multiple_of_rollouts, world_of_posterior
 from simpel_cli.inference import loop
 from simpel_cli.inference.protocols import Problem
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.metrics import MetricStream
-from simpel_cli.runs.settings import Settings, stream
-from simpel_cli.studies.study import source_of
-from simulators.model import Model
+from simpel_cli.runs.settings import stream
+from simpel_cli.studies.fit import Learned
 
 Judge = Callable[[Policy, PRNGKeyArray], Episodes]  # leaves of the policy (runs, ...)
-
-
-class Assignment(NamedTuple):
-    """What a controller is asked for, and where.
-
-    Args:
-        task: as declared.
-        encoding: of the simulator's quantities.
-        goal: bound to the quantities.
-        control: how the policy meets the model.
-        policy: how it learns.
-        planner: in its place, plans in the model at every step; None: a policy is learned.
-        source: the simulator.
-        truth: the true world; None: there is none to judge in.
-        truth_name: its name.
-    """
-
-    task: Task
-    encoding: Encoding
-    goal: Goal
-    control: Control
-    policy: SAC
-    planner: ICEM | None
-    source: Source
-    truth: World | None
-    truth_name: str
-
-    @property
-    def memory(self) -> int:
-        """Past commands that a policy sees."""
-        return max(self.encoding.stack, int(self.goal.uses_before))
 
 
 class Best(NamedTuple):
@@ -76,7 +35,7 @@ class Best(NamedTuple):
     returns: Float[Array, " runs"]
 
 
-class Flown(NamedTuple):
+class TrainedPolicies(NamedTuple):
     """What training a policy came to, or planning.
 
     Args:
@@ -94,143 +53,6 @@ class Flown(NamedTuple):
     compile_seconds: float
 
 
-def assignment(config: dict[str, Any], settings: Settings) -> Assignment:
-    """Build the groups of control, before anything is fitted.
-
-    Raises:
-        ConfigError: a key, or quantities of the truth that are not those of the simulator.
-    """
-    if not config.get("reward"):
-        raise ConfigError("reward: missing; name a task, e.g. reward=parking, or an experiment that brings one.")
-    task = build(config["reward"], "reward", settings.plugins, default=Task)
-    control = build(config.get("control") or {}, "control", default=Control)
-    policy = build(config["policy"], "policy", settings.plugins, default=SAC)
-    planner = build(config["planner"], "planner", settings.plugins, default=ICEM) if config.get("planner") else None
-    source = source_of(config, settings)
-    if not source.states:
-        raise ConfigError(f"sim: {source.name} has no states, so that there is nothing to control.")
-    encoding = encoding_of(source, stack=int(config["data"].get("stack_actions") or 0))
-    goal = task.bind(encoding)
-    truth, name = None, ""
-    if config.get("truth"):
-        true = source_of({"sim": config["truth"]}, settings)
-        truth, name = _true_world(true, task, goal, encoding, source.dt), true.name
-    return Assignment(task, encoding, goal, control, policy, planner, source, truth, name)
-
-
-def task_table(asked: Assignment) -> dict[str, Any]:
-    """Return the report's table of what was asked for."""
-    task, source = asked.task, asked.source
-    begins = {q.name: task.initial.get(q.name, 0.0) for q in source.states}
-    rows = [
-        ("reward of a step", task.reward),
-        *((f"... {name}", str(text)) for name, text in task.names.items()),
-        ("horizon", f"{task.horizon} steps of {source.dt:.4g} s"),
-        ("begins at", ", ".join(f"{name} {value}" for name, value in begins.items())),
-        ("commands", ", ".join(
-            f"{q.name} {low:g} to {high:g} {q.unit}".rstrip()
-            for q, low, high in zip(asked.encoding.inputs, asked.goal.low, asked.goal.high, strict=True)
-        )),
-    ]  # fmt: skip
-    if task.success:
-        rows.append(("succeeded", f"{task.success} in each of the last {task.settled} steps"))
-    if task.stop:
-        rows.append(("ends where", task.stop))
-    return {"title": "Task", "head": (), "rows": rows, "text": True}
-
-
-def remarks(asked: Assignment) -> list[str]:
-    """Return what is odd about a task, a line each."""
-    found = []
-    for q in asked.source.states:
-        low, high = asked.task.begins(q.name)
-        if not q.periodic and (low < q.low - 0.1 * (q.high - q.low) or high > q.high + 0.1 * (q.high - q.low)):
-            found.append(
-                f"reward.initial.{q.name}: {asked.task.initial.get(q.name, 0.0)} reaches beyond its range "
-                f"[{q.low:g}, {q.high:g}] {q.unit} (sim.states.{q.name}): the model knows nothing there"
-            )
-    return found
-
-
-def _true_world(source: Any, task: Task, goal: Goal, own: Encoding, dt: float) -> World:
-    if not isinstance(source, Model):
-        raise ConfigError(
-            f"truth: {source.name} answers queries only; name a simulator with equations, e.g. sim@truth=..."
-        )
-    encoding = encoding_of(source, stack=own.stack)
-    check_comparable("truth", source, own, goal, dt)
-    phi = jnp.asarray([q.middle for q in source.params], jnp.float32)
-    noise = jnp.asarray([task.noise_std.get(q.name, 0.0) for q in own.states], jnp.float32)
-    return true_world(encoding, goal, transition(source, encoding).step, phi, noise)
-
-
-def refuse_outputs(encoding: Encoding) -> None:
-    """Refuse measurements of more than states.
-
-    Raises:
-        ConfigError: names what is measured.
-    """
-    if encoding.outputs:
-        measured = ", ".join(q.name for q in encoding.outputs)
-        raise ConfigError(
-            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
-        )
-
-
-def _multiple(learned: Learned, asked: Assignment) -> int:
-    """Return what the number of roll-outs in a posterior is a multiple of."""
-    return 1 if asked.control.sampling == "mean" else learned.study.method.particles
-
-
-def world_of_posterior(learned: Learned, asked: Assignment) -> Callable[[tuple[Problem, Any], float], World]:
-    """Return the map from a problem, a posterior's state and a share of roll-outs that begin at data to its world."""
-    study, control = learned.study, asked.control
-    encoding = study.system.encoding
-
-    def world_at(arrays: tuple[Problem, Any], share: float) -> World:
-        problem, state = arrays
-        rule = learned.fitted.bind(problem)
-        noise = rule.predict(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype)).noise_std
-        world = learned_world(
-            encoding, asked.goal, lambda x: rule.members(state, x), noise, study.method.particles, control.sampling,
-            aleatoric=control.aleatoric,
-        )  # fmt: skip
-        return beginning_at(world, encoding, jnp.asarray(problem.x), jnp.asarray(problem.m), share)
-
-    return world_at
-
-
-def plan(learned: Learned, asked: Assignment) -> tuple[Flown, Episodes | None]:
-    """Let a planner act in every seed's posterior and, planning there, in the true world.
-
-    Returns:
-        What it earns in the model, and its episodes in the true world, leaves (seeds, ...).
-    """
-    planner, control, task = asked.planner, asked.control, asked.task
-    assert planner is not None
-    world_at, dim_u = world_of_posterior(learned, asked), len(asked.encoding.inputs)
-    multiple = _multiple(learned, asked)
-    number = -(-control.episodes // multiple) * multiple
-
-    def in_model(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> tuple[Any, Any]:
-        world = world_at(arrays, 0.0)
-        found = episodes(world, planner.bind(world, task.horizon, dim_u), key, number, task.horizon)
-        return jnp.mean(found.returns), jnp.mean(found.broken.astype(jnp.float32))
-
-    def in_truth(arrays: tuple[Problem, Any], key: PRNGKeyArray) -> Episodes:
-        assert asked.truth is not None
-        controller = planner.bind(world_at(arrays, 0.0), task.horizon, dim_u)
-        return episodes(asked.truth, controller, key, control.episodes, task.horizon)
-
-    problems = jax.tree.map(jnp.asarray, (learned.fitted.assembled.problems, learned.state))
-    began = time.perf_counter()
-    earned, broken = jax.jit(jax.vmap(in_model, in_axes=(0, None)))(problems, stream(0, "judge"))
-    judged = None
-    if asked.truth is not None:
-        judged = jax.jit(jax.vmap(in_truth, in_axes=(0, None)))(problems, stream(0, "judge in the truth"))
-    return Flown(None, np.asarray(earned), np.asarray(broken), time.perf_counter() - began, 0.0), judged
-
-
 def train(
     learned: Learned,
     asked: Assignment,
@@ -241,7 +63,7 @@ def train(
     label: str = "policy",
     before: Path | None = None,
     rival: Policy | None = None,
-) -> Flown:
+) -> TrainedPolicies:
     """Train policies in every seed's posterior; the best of each seed, by what it earns in the model, is kept.
 
     A checkpoint in the directory is gone on with.
@@ -268,7 +90,7 @@ def train(
         lambda a: jnp.repeat(jnp.asarray(a), sac.policies, axis=0), (fitted.assembled.problems, learned.state)
     )
     keys = jnp.stack([jax.random.fold_in(stream(s, "policy"), i) for s in seeds for i in range(sac.policies)])
-    multiple = _multiple(learned, asked)
+    multiple = multiple_of_rollouts(learned, asked)
     iterations = sac.iterations(multiple)
     stretch = max(1, -(-iterations // sac.looks))
     judged = -(-control.episodes // multiple) * multiple
@@ -341,7 +163,7 @@ def train(
     anew = model_judge(problems, best.policy, stream(0, "judge anew"))
     chosen = np.asarray(best.returns).reshape(len(seeds), -1).argmax(axis=1) + np.arange(len(seeds)) * sac.policies
     policies, earned, broken = jax.tree.map(lambda a: a[chosen], (best.policy, *map(np.asarray, anew)))
-    return Flown(policies, earned, broken, time.perf_counter() - began, program.compile_seconds)
+    return TrainedPolicies(policies, earned, broken, time.perf_counter() - began, program.compile_seconds)
 
 
 def _said(best: Best, true: np.ndarray | None) -> str:

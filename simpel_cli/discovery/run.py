@@ -1,0 +1,199 @@
+"""A search as a whole: find what the simulator lacks, name it, add it, and say how much that helps."""
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from simpel_cli.config.launch import Job
+from simpel_cli.config.resolved import dump
+from simpel_cli.data import Recording
+from simpel_cli.discovery.likelihood.fit import Fitter
+from simpel_cli.discovery.measurements.cleaning import cleaned, outlier_check
+from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.discovery.next_experiment.design import next_experiment
+from simpel_cli.discovery.search.acceptance import accepted, with_interactions
+from simpel_cli.discovery.search.calibration import calibrated, shortlisted
+from simpel_cli.discovery.search.disturbances import Swing, swing
+from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
+from simpel_cli.discovery.search.gate import Gate
+from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.setup import setup, terms_of
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.verdict.corrected import corrected
+from simpel_cli.discovery.verdict.evidence import exhibits
+from simpel_cli.discovery.verdict.remainder import remainder_of
+from simpel_cli.discovery.verdict.undetectable import caveats, unseen
+from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
+from simpel_cli.errors import ConfigError, Inconclusive
+from simpel_cli.runs.console import Terminal
+from simpel_cli.runs.directory import make_directory, refuse_occupied
+from simpel_cli.runs.files import strict as strict_json
+from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.manifest import Manifest
+from simpel_cli.studies.close_loop import close, past_inputs
+from simpel_cli.studies.declared import Declared, declare, resolved
+from simpel_cli.studies.open import Study, open_study, refuse_untested
+from simulators.effects import Expression
+from simulators.model import Model
+
+Publish = Callable[[Terminal, dict[str, Any], Path, dict[str, Any]], Any]  # terminal, verdict, directory, configuration
+
+
+class Searched(NamedTuple):
+    """What a search came to, before it is put into words.
+
+    Args:
+        search: its fits.
+        assessor: of errors ahead.
+        selection: the models before and after.
+        gates: what every chosen effect adds on held-out episodes.
+        disturbance: a force that goes with time alone; None: there is none.
+        windows: held-out ones.
+        recording: the measurements that were searched in, with what was found in them.
+    """
+
+    search: Search
+    assessor: Assessor
+    selection: Selection
+    gates: list[Gate]
+    disturbance: Swing | None
+    windows: Windows
+    recording: Recording
+
+
+def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
+    """Run a search in its run directory.
+
+    Args:
+        job: of the verb.
+        publish: prints the verdict and writes the report.
+        strict: whether another verdict than `effect` is an error.
+
+    Raises:
+        Inconclusive: `strict` and another verdict than `effect`.
+    """
+    declared = declare(resolved(job))
+    declared = declared.changed(run={**(declared.config.get("run") or {}), "precision": "float64"})
+    directory = make_directory(job.directory)
+    refuse_occupied(directory)
+    write_text(directory / "config.yaml", dump(declared.config))
+    with Manifest(directory, "discover", declared.settings) as manifest, jax.enable_x64(True):
+        found = _run(declared, job.data_folder, manifest, publish)
+    if strict and found["verdict"] != "effect":
+        raise Inconclusive(f"verdict {found['verdict']}: {found['summary']}")
+
+
+def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Publish) -> dict[str, Any]:
+    began, directory = time.perf_counter(), manifest.directory
+    study = open_study(declared, data_folder, whole=False)
+    refuse_untested(study.recording)
+    manifest.add_inputs(study.recording.files)
+    if not isinstance(study.system.source, Model):
+        raise ConfigError(
+            "sim: discover needs a simulator in symbols, since effects are terms of it; a world has none."
+        )
+    if not declared.groups.get("effect"):
+        raise ConfigError(
+            "effect: none chosen; use effect=[all], or name some, e.g. effect=[coulomb_friction,input_delay]."
+        )
+    terminal = Terminal(study.settings.quiet, directory / "run.log")
+    searched = _search(study, terminal)
+    search, selection, assessor = searched.search, searched.selection, searched.assessor
+    before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
+    found = _verdict(searched, before, after, time.perf_counter() - began)
+    if found["verdict"] == AMBIGUOUS:
+        terminal.line("which experiment tells them apart", "search")
+        found["next_experiment"] = next_experiment(search, selection, directory)
+    if found["effects"]:
+        found |= _correct(declared, searched, found, directory, data_folder, terminal)
+    write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
+    shown = exhibits(search, selection, assessor, searched.recording, searched.windows, before, after)
+    for name, table in shown.items():
+        write_table(directory / f"{name}.parquet", table.columns, table.units)
+    publish(terminal, found, directory, declared.config)
+    return found
+
+
+def _search(study: Study, terminal: Terminal) -> Searched:
+    """Clean the measurements, calibrate the simulator, choose effects, and accept those that help on held-out episodes."""
+    model, groups = study.system.source, study.declared.groups
+    assert isinstance(model, Model)
+    options: Discovery = groups.get("discovery") or Discovery()
+    effects: list[Expression] = groups["effect"]
+    terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
+    declared_noise = tuple(study.measurements.noise_std)
+    clean = cleaned(study.recording, model, declared_noise)
+    recording = clean.recording
+    bad = [c for c in recording.checks if not c.ok]
+    terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")
+    attach = partial(
+        setup, model, recording, declared_noise, effects, options.substeps, pairs=options.pairs, most_rows=options.rows
+    )
+    rows = sum(len(e.time) for e in recording.train)
+    if rows > options.rows:
+        terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
+    plan = attach(kept=shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal))
+    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
+    assessor = Assessor(plan, options.horizon)
+    search, base, windows, clean = calibrated(plan, fitter, assessor, clean, terminal)
+    outliers = outlier_check(clean, plan.augmented.measured)
+    terminal.line(outliers.detail, "outliers")
+    selection, gates = accepted(search, assessor, base, options, terminal)
+    levels = Levels(search, assessor, selection.chosen)
+    selection, gates = with_interactions(levels, selection, gates, attach, options, terminal)
+    disturbance = None if selection.remainder else swing(levels)
+    if disturbance is not None:
+        terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
+    recording = recording._replace(checks=(*recording.checks, outliers))
+    return Searched(search, assessor, selection, gates, disturbance, windows, recording)
+
+
+def _verdict(searched: Searched, before: Assessment, after: Assessment, seconds: float) -> dict[str, Any]:
+    """Return what `verdict.json` holds of the search itself."""
+    search, assessor, selection, gates, disturbance, windows, recording = searched
+    left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
+    found = verdict_of(
+        search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
+    )
+    found["steps"] = steps_of(search, selection, assessor, windows)
+    found["not_tested"] = unseen(search, selection.chosen, recording.train)
+    unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
+    found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
+    found["summary"] += caveats(found)
+    return found
+
+
+def _correct(
+    declared: Declared,
+    searched: Searched,
+    found: dict[str, Any],
+    directory: Path,
+    data_folder: Path,
+    terminal: Terminal,
+) -> dict[str, Any]:
+    """Write the corrected simulator, and compare both as priors; returns what the verdict says of it."""
+    config, model = declared.config, declared.source
+    assert isinstance(model, Model)
+    name, node, left_out = corrected(config["sim"], model, searched.search, searched.selection.chosen)
+    path = directory / "conf" / "sim" / f"{name}.yaml"
+    data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
+    for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
+        file.parent.mkdir(parents=True)
+        write_text(file, content)
+    after = declared.changed(sim=node)
+    told: dict[str, Any] = {
+        "corrected_sim": str(path.relative_to(directory)),
+        "corrected_sim_lacks": left_out,
+        "stack_actions": past_inputs(after.source),
+    }
+    if config.get("close", True) and len(left_out) < len(found["effects"]):
+        told["as_prior"] = close(declared, after, directory, data_folder, terminal)
+    return told

@@ -1,0 +1,98 @@
+"""Which of the effects that a search has chosen are accepted on held-out episodes."""
+
+from collections.abc import Callable
+
+from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.gate import Gate, gates
+from simpel_cli.discovery.search.interactions import interaction
+from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.runs.console import Terminal
+
+MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
+
+
+def accepted(
+    search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
+) -> tuple[Selection, list[Gate]]:
+    """Search, and go on without an effect that does harm: another one may be what it stood for."""
+    selection = select(search, base, options.beginnings)
+    for attempt in range(MOST_SEARCHES):
+        selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
+        if not harmful or attempt == MOST_SEARCHES - 1:  # what is returned has been judged
+            break
+        left, selection = selection, further(search, selection)
+        if selection.chosen.terms == left.chosen.terms:
+            break
+    return selection, judged
+
+
+def gated_selection(
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
+) -> tuple[Selection, list[Gate], list[int]]:
+    """Judge on held-out episodes what every effect adds to the others; of those that fail one goes at a time.
+
+    Effects that are of use only together, as a delay and a slip, are judged together so. Of two that can stand for each other
+    the one with less evidence goes, and the other is judged without it.
+
+    Returns:
+        what is left of the selection, its gates, and the terms with which the errors ahead grow.
+    """
+    harmful: list[int] = []
+    while selection.chosen.terms:
+        chosen = selection.chosen
+        parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
+        judged = gates(search, assessor, chosen, parts)
+        failed = [i for i, found in enumerate(judged) if not found.passed]
+        gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
+        for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
+            _told(search.terms[term].label, found, terminal, out=i == gone)
+        if gone is None:
+            return selection, judged, harmful
+        if judged[gone].harm:
+            harmful.append(chosen.terms[gone])
+            search.banned.add(chosen.terms[gone])  # nor is it another name for what stays
+        selection = refused(search, selection, gone)
+    return selection, [], harmful
+
+
+def with_interactions(
+    levels: Levels,
+    selection: Selection,
+    judged: list[Gate],
+    attach: Callable[..., Setup],
+    options: Discovery,
+    terminal: Terminal,
+) -> tuple[Selection, list[Gate]]:
+    """Look once more whether what is left is a function of two arguments."""
+    known = selection.remainder[1] if selection.remainder else 0.0
+    told = lambda text: terminal.line(text, "search")  # noqa: E731
+    found = interaction(levels, attach, options.lanes, told, known)
+    if found is None:
+        return selection, judged
+    _told(
+        f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}",
+        found.gate,
+        terminal,
+        out=not found.gate.passed,
+    )
+    if not found.gate.passed:
+        return selection, judged
+    gone = [levels.search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
+    if gone:
+        told(f"beside it {' and '.join(gone)} is not needed")
+        selection = cut(levels.search, selection, found.kept)
+        judged = [judged[i] for i in found.kept]
+    return selection._replace(remainder=(found.term, found.gain)), judged
+
+
+def _told(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
+    why = "" if judged.passed else ", the errors ahead grow" if judged.harm else ", not certain"
+    terminal.line(
+        f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
+        f" by {judged.unit}{why}{': not accepted' if out else ''}",
+        "gate",
+    )

@@ -1,0 +1,102 @@
+"""Every group of a configuration as an object, built once; what comes after assembles them and builds nothing again."""
+
+from typing import Any, NamedTuple
+
+from simpel_cli.config.launch import Job
+from simpel_cli.config.nodes import build_groups
+from simpel_cli.data import Measurements, absolute
+from simpel_cli.data.recording import Source
+from simpel_cli.evaluation.settings import Evaluation
+from simpel_cli.inference.protocols import Method
+from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
+from simpel_cli.runs.settings import Settings
+
+
+class Declared(NamedTuple):
+    """A configuration, and its groups as objects.
+
+    Args:
+        config: resolved, as the run directory keeps it.
+        groups: every group that the configuration has, by name; None where it is null.
+    """
+
+    config: dict[str, Any]
+    groups: dict[str, Any]
+
+    @property
+    def settings(self) -> Settings:
+        """The group `run`."""
+        found: Settings = self.groups["run"]
+        return found
+
+    @property
+    def source(self) -> Source:
+        """The simulator: a symbolic model, or a world with query access only."""
+        return self.groups["sim"]
+
+    @property
+    def measurements(self) -> Measurements:
+        """The group `data`."""
+        found: Measurements = self.groups["data"]
+        return found
+
+    @property
+    def prior(self) -> SimulatorPrior | GPPrior:
+        """The prior over functions."""
+        found: SimulatorPrior | GPPrior = self.groups["prior"]
+        return found
+
+    @property
+    def score(self) -> Any:
+        """The score estimator."""
+        return self.groups["score"]
+
+    @property
+    def method(self) -> Method:
+        """The inference rule."""
+        found: Method = self.groups["method"]
+        return found
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """How a posterior is judged."""
+        return self.groups.get("evaluation") or Evaluation()
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """The option that was chosen of every group."""
+        found: dict[str, Any] = self.config["choices"]
+        return found
+
+    def without(self, *names: str) -> "Declared":
+        """Return the configuration without some groups and keys."""
+        return self._replace(
+            config={k: v for k, v in self.config.items() if k not in names},
+            groups={k: v for k, v in self.groups.items() if k not in names},
+        )
+
+    def changed(self, **nodes: Any) -> "Declared":
+        """Return the configuration with other nodes; only these are built.
+
+        Raises:
+            ConfigError: what a group's class refuses.
+        """
+        built = build_groups({"run": self.config.get("run"), **nodes})
+        return self._replace(config=self.config | nodes, groups=self.groups | {name: built[name] for name in nodes})
+
+
+def declare(config: dict[str, Any]) -> Declared:
+    """Build every group of a resolved configuration: whatever is wrong in it is found before any file is read.
+
+    Raises:
+        ConfigError: a key.
+    """
+    return Declared(config, build_groups(config))
+
+
+def resolved(job: Job) -> dict[str, Any]:
+    """Return the configuration as it is kept in the run directory: absolute path of the data, choices of groups."""
+    config = dict(job.config)
+    if isinstance(config.get("data"), dict):
+        config["data"] = absolute(config["data"], job.data_folder)
+    return config

@@ -1,0 +1,96 @@
+"""From a study to the problems of every seed, and from a trained state to posteriors."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from simpel_cli.data import no_transitions, select, transitions
+from simpel_cli.evaluation import Posterior, test_arrays
+from simpel_cli.inference.assemble import Assembled, assemble
+from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting
+from simpel_cli.inference.system import normaliser_of
+from simpel_cli.runs.settings import stream
+from simpel_cli.studies.open import Study
+
+STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
+
+
+class Fitted(NamedTuple):
+    """A rule bound to the training transitions of every seed."""
+
+    assembled: Assembled
+    bind: Callable[[Problem], Inference]
+    keys: Key[Array, " seeds"]
+    training: list[tuple[np.ndarray, np.ndarray]]
+    available: int  # training transitions that `data.n_train` chose from
+    normaliser: Normaliser
+
+    @property
+    def n_train(self) -> int:
+        """Number of training transitions."""
+        return len(self.training[0][0])
+
+    @property
+    def target_std(self) -> np.ndarray:
+        """Spread of the targets over the simulator's ranges, in data units, as the networks were trained with."""
+        return np.asarray(self.assembled.problems.normaliser.y_std[0], dtype=float)
+
+
+def prepare(study: Study) -> Fitted:
+    """Choose the training transitions of every seed and assemble the problems."""
+    settings, measurements = study.settings, study.measurements
+    source, stack = study.system.source, measurements.stack_actions
+    recorded = study.recording.train
+    pairs = transitions(recorded, stack) if recorded else no_transitions(source, len(study.recording.outputs), stack)
+    training = [
+        test_arrays(
+            select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding
+        )
+        for seed in settings.all_seeds
+    ]
+    # one normaliser for all seeds and all n_train: results stay comparable
+    normaliser = normaliser_of(study.system, stream(0, "normaliser"))
+    assembled = assemble(
+        study.system,
+        normaliser,
+        study.prior,
+        study.declared.score,
+        training,
+        study.recording.noise_std,
+        study.measurements.noise_std,
+        noise=study.method.noise,
+        pool=study.method.pool,
+        keys=[stream(seed, "prior") for seed in settings.all_seeds],
+        precision=settings.precision,
+    )
+    keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
+    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
+
+
+def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:
+    def bind(problem: Problem) -> Inference:
+        return method.bind(setting, problem)
+
+    return bind
+
+
+def posteriors(study: Study, fitted: Fitted, state: Any) -> list[Posterior]:
+    """Return the posterior of every seed as functions of arrays in data units."""
+    bind, assembled = fitted.bind, fitted.assembled
+    predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
+    members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
+    dtype = assembled.problems.x.dtype
+
+    def of_seed(i: int) -> Posterior:
+        problem, own = jax.tree.map(lambda a: a[i], (assembled.problems, state))
+        return Posterior(
+            predict=lambda x: predict(problem, own, jnp.asarray(x, dtype)),
+            members=lambda x: members(problem, own, jnp.asarray(x, dtype)),
+            particles=study.method.particles,
+        )
+
+    return [of_seed(i) for i in range(study.settings.seeds)]

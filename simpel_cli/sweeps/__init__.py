@@ -1,0 +1,1 @@
+"""Sweeps: jobs on workers, retried and resumed, collected into one table."""
