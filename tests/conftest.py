@@ -12,8 +12,8 @@ from command_line import KEPT, ROOT
 import simpel_cli  # noqa: F401  sets XLA's flags before JAX opens its backend
 
 LONGEST = (
-    "wrong_inputs", "cli", "discover", "resume", "discovery_filter", "methods", "own_data", "recorded_systems", "scores",
-    "discover_hopeless", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
+    "wrong_inputs", "cli", "discover", "resume", "filter", "methods", "own_data", "recorded_systems", "estimators",
+    "uninformative_data", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
     "control", "pathwise",
 )  # fmt: skip
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs

@@ -15,7 +15,7 @@ SYMBOLIC = sorted(p.stem for p in SIMS.glob("*.yaml") if "_target_: simulators.w
 def node(name: str) -> dict[str, Any]:
     """Fields of a declared simulator."""
     content = whole_node(name)
-    assert content.pop("_target_") == "simulators.model.Declared"
+    assert content.pop("_target_", "simulators.model.Declared") == "simulators.model.Declared"
     return content
 
 

@@ -75,21 +75,33 @@ def build_source(node: Any, path: str, plugins: tuple[str, ...] = ()) -> Any:
         raise ConfigError(str(error)) from error
 
 
-def build_groups(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Build every group of a configuration, once; one that is null stays None. `effect` becomes a list.
+def build_settings(config: Mapping[str, Any]) -> Any:
+    """Build the group `run`, which a run directory is begun with, and refuse keys that no verb has.
 
     Raises:
-        ConfigError: a key that no verb has, or what a group's class refuses.
+        ConfigError: such a key, or what the group's class refuses.
     """
     for key in config:
         if key not in CLASSES and key not in PLAIN_KEYS:
             groups = list(CLASSES)
             raise ConfigError(f"{key}: no such key.{did_you_mean(key, groups)} (groups: {', '.join(groups)})")
-    built: dict[str, Any] = {"run": build(config.get("run") or {}, "run")}
-    plugins = built["run"].plugins
+    return build(config.get("run") or {}, "run")
+
+
+def build_groups(config: Mapping[str, Any], settings: Any) -> dict[str, Any]:
+    """Build every other group of a configuration, once; one that is null stays None. `effect` becomes a list.
+
+    Args:
+        config: resolved.
+        settings: the group `run`, built.
+
+    Raises:
+        ConfigError: what a group's class refuses.
+    """
+    built: dict[str, Any] = {"run": settings}
     for name, node in config.items():
         if name in CLASSES and name != "run":
-            built[name] = None if node is None else _build_group(node, name, plugins)
+            built[name] = None if node is None else _build_group(node, name, settings.plugins)
     return built
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.config.launch import Job
-from simpel_cli.config.resolved import dump, of_run
+from simpel_cli.config.resolved import of_run
 from simpel_cli.control.agents.rollout import Episodes
 from simpel_cli.control.assignment import Assignment, assignment, refuse_outputs, remarks
 from simpel_cli.control.planning import plan
@@ -16,8 +16,7 @@ from simpel_cli.control.settings import CONTROL_GROUPS
 from simpel_cli.control.training import TrainedPolicies, judge_of, train
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied
-from simpel_cli.runs.files import write_table, write_text
+from simpel_cli.runs.files import write_table
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
 from simpel_cli.runs.metrics import MetricStream
@@ -25,6 +24,7 @@ from simpel_cli.runs.settings import configure, stream
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import Declared, declare, resolved
 from simpel_cli.studies.fit import Learned, learned
+from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import open_study
 from simpel_cli.studies.screen import Screen
 
@@ -40,12 +40,8 @@ def rl_offline(job: Job, screen: Screen, publish: Publish) -> None:
         screen: what the fit shows.
         publish: prints the result, draws the figures and writes the report.
     """
-    declared = declare(resolved(job))
-    directory = make_directory(job.directory)
-    refuse_occupied(directory)
-    write_text(directory / "config.yaml", dump(declared.config))
-    with Manifest(directory, "rl-offline", declared.settings) as manifest:
-        _run(declared, directory, job.data_folder, manifest, screen, publish)
+    with new_run("rl-offline", resolved(job), job.directory) as (declared, manifest):
+        _run(declared, job.directory, job.data_folder, manifest, screen, publish)
 
 
 def resume(directory: Path, screen: Screen, publish: Publish) -> None:

@@ -32,7 +32,7 @@ from simpel_cli.control.training import TrainedPolicies, train
 from simpel_cli.data import transitions
 from simpel_cli.errors import ConfigError, DataError, NumericsError
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied
+from simpel_cli.runs.directory import make_directory
 from simpel_cli.runs.files import write_text
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
@@ -41,6 +41,7 @@ from simpel_cli.runs.settings import configure
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import Declared, declare, resolved
 from simpel_cli.studies.fit import Learned, learned
+from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import open_study
 from simpel_cli.studies.prepare import posteriors
 from simpel_cli.studies.screen import Screen
@@ -67,12 +68,8 @@ def rl_online(job: Job, screen: Screen, publish: Publish) -> None:
     kind, _, rest = str(config.get("world")).partition(":")
     if kind == "folder" and rest:  # a resumed run may start elsewhere
         config["world"] = f"folder:{Path(rest).expanduser().absolute()}"
-    declared = declare(config)
-    directory = make_directory(job.directory)
-    refuse_occupied(directory)
-    write_text(directory / "config.yaml", dump(config))
-    with Manifest(directory, "rl-online", declared.settings) as manifest:
-        _run(declared, directory, manifest, screen, publish)
+    with new_run("rl-online", config, job.directory) as (declared, manifest):
+        _run(declared, job.directory, manifest, screen, publish)
 
 
 def resume(directory: Path, screen: Screen, publish: Publish, overrides: Sequence[str] = ()) -> None:

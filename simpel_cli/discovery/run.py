@@ -33,12 +33,12 @@ from simpel_cli.discovery.verdict.undetectable import caveats, unseen
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import strict as strict_json
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import Manifest
 from simpel_cli.studies.close_loop import close, past_inputs
-from simpel_cli.studies.declared import Declared, declare, resolved
+from simpel_cli.studies.declared import Declared, resolved
+from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import Study, open_study, refuse_untested
 from simulators.effects import Expression
 from simulators.model import Model
@@ -79,12 +79,9 @@ def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
     Raises:
         Inconclusive: `strict` and another verdict than `effect`.
     """
-    declared = declare(resolved(job))
-    declared = declared.changed(run={**(declared.config.get("run") or {}), "precision": "float64"})
-    directory = make_directory(job.directory)
-    refuse_occupied(directory)
-    write_text(directory / "config.yaml", dump(declared.config))
-    with Manifest(directory, "discover", declared.settings) as manifest, jax.enable_x64(True):
+    config = resolved(job)
+    config["run"] = {**(config.get("run") or {}), "precision": "float64"}
+    with new_run("discover", config, job.directory) as (declared, manifest), jax.enable_x64(True):
         found = _run(declared, job.data_folder, manifest, publish)
     if strict and found["verdict"] != "effect":
         raise Inconclusive(f"verdict {found['verdict']}: {found['summary']}")

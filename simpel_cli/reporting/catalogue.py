@@ -109,7 +109,7 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
         terminal.line()
         terminal.line(", ".join(f"{k} = {v:g}" for k, v in fixed.items()), "known")
     terminal.line()
-    target = str(entry.node.get("_target_"))
+    target = str(entry.node.get("_target_", DECLARED))
     dynamics = entry.node.get("dynamics") or {}
     derived = {k: v for k, v in (entry.node.get("parameters") or {}).items() if isinstance(v, str)}
     for left, formula in [*derived.items(), *((f"d{k}/dt", v) for k, v in dynamics.items())]:

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from simpel_cli.config.launch import Job
-from simpel_cli.config.nodes import build_groups
+from simpel_cli.config.nodes import build_groups, build_settings
 from simpel_cli.data import Measurements, absolute
 from simpel_cli.data.recording import Source
 from simpel_cli.evaluation.settings import Evaluation
@@ -81,17 +81,21 @@ class Declared(NamedTuple):
         Raises:
             ConfigError: what a group's class refuses.
         """
-        built = build_groups({"run": self.config.get("run"), **nodes})
-        return self._replace(config=self.config | nodes, groups=self.groups | {name: built[name] for name in nodes})
+        settings = build_settings(nodes) if "run" in nodes else self.settings
+        return self._replace(config=self.config | nodes, groups=self.groups | build_groups(nodes, settings))
 
 
-def declare(config: dict[str, Any]) -> Declared:
+def declare(config: dict[str, Any], settings: Settings | None = None) -> Declared:
     """Build every group of a resolved configuration: whatever is wrong in it is found before any file is read.
+
+    Args:
+        config: the configuration.
+        settings: its group `run`, where it is built already.
 
     Raises:
         ConfigError: a key.
     """
-    return Declared(config, build_groups(config))
+    return Declared(config, build_groups(config, settings or build_settings(config)))
 
 
 def resolved(job: Job) -> dict[str, Any]:

@@ -4,18 +4,17 @@ from pathlib import Path
 from typing import Any
 
 from simpel_cli.config.launch import Job
-from simpel_cli.config.resolved import dump, of_run
+from simpel_cli.config.resolved import of_run
 from simpel_cli.data import Check
 from simpel_cli.data.summary import held_out_summary
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied
-from simpel_cli.runs.files import write_text
-from simpel_cli.runs.manifest import Manifest, read_manifest, sha256
+from simpel_cli.runs.manifest import read_manifest, sha256
 from simpel_cli.runs.metrics import write_metrics
-from simpel_cli.studies.declared import Declared, declare, resolved
+from simpel_cli.studies.declared import Declared, resolved
 from simpel_cli.studies.fit import refuse_changed_inputs
 from simpel_cli.studies.judgement import judge
+from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import posteriors, prepare
 from simpel_cli.studies.screen import Screen
@@ -51,11 +50,8 @@ def evaluate(job: Job, screen: Screen) -> None:
             f"data.{key}: evaluate keeps the run's own data; for another data.{key} fit again. To judge on other "
             f"measurements, name them: data=NAME. (evaluate takes data=NAME and its keys, evaluation.horizon, {settings})"
         )
-    declared = declare(config)
-    directory = make_directory(job.directory)
-    refuse_occupied(directory)
-    write_text(directory / "config.yaml", dump(config | ({"judged_on": own["data"]} if own.get("data") else {})))
-    with Manifest(directory, "evaluate", declared.settings) as manifest:
+    directory, beside = job.directory, {"judged_on": own["data"]} if own.get("data") else {}
+    with new_run("evaluate", config, directory, beside=beside) as (declared, manifest):
         study = open_study(declared, run)
         refuse_changed_inputs(record, study.recording.files)
         step, state, fitted = checkpointed_state(run, prepare(study))

@@ -9,13 +9,14 @@ from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.inference import loop
 from simpel_cli.runs.console import Terminal
-from simpel_cli.runs.directory import make_directory, refuse_occupied, typed
+from simpel_cli.runs.directory import make_directory, typed
 from simpel_cli.runs.files import write_table, write_text
 from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config, sha256
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import declare, resolved
 from simpel_cli.studies.judgement import judge
+from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import STRETCH, Fitted, posteriors, prepare
 from simpel_cli.studies.prior_check import prior_check
@@ -33,11 +34,7 @@ class Learned(NamedTuple):
 
 def fit(job: Job, screen: Screen) -> None:
     """Run a new fit in its run directory."""
-    declared = declare(resolved(job))
-    directory = make_directory(job.directory)
-    refuse_occupied(directory)
-    write_text(directory / "config.yaml", dump(declared.config))
-    with Manifest(directory, "fit", declared.settings) as manifest:
+    with new_run("fit", resolved(job), job.directory) as (declared, manifest):
         _run(open_study(declared, job.data_folder), manifest, screen, resume=False)
 
 

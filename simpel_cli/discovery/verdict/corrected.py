@@ -49,7 +49,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             parameters[short] = (
                 {"unit": knob.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
             )
-    write = _declared if sim.get("_target_") == DECLARED else _extended
+    write = _declared if sim.get("_target_", DECLARED) == DECLARED else _extended
     node = write(sim, name, written, names, parameters)
     return name, node, [f"{t.label} ({CANNOT[t.kind]})" for t in terms if t.kind in CANNOT]
 

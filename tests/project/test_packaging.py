@@ -73,7 +73,9 @@ def test_make_help_lists_every_target() -> None:
     if shutil.which("make") is None:
         pytest.skip("make is not installed")
     rules = set(re.findall(r"^([a-z][a-z_-]*):(?!=)", (ROOT / "Makefile").read_text(), re.M))
-    shown = subprocess.run(["make", "-s", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    shown = subprocess.run(
+        ["make", "-s", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     plain = re.sub(r"\x1b\[\d*m", "", shown)
     listed = {line.split()[0] for line in plain.splitlines() if line.strip()}
     assert listed == rules

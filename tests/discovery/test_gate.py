@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_aliases import searched
 
 from simpel_cli.discovery.likelihood.fit import Lane, Optimum
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.gate import RUNAWAY, gates, harmful
 from simpel_cli.discovery.search.trials import Trial
-from tests.test_twins import searched
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_discovery_filter import LOAD, A, B, model, recording
+from test_filter import LOAD, A, B, model, recording
 
 from simpel_cli.discovery.likelihood.fit import Fitter, Optimum
 from simpel_cli.discovery.search.errors_ahead import Assessor

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from command_line import process
 
-TRUTH = Path(__file__).parent / "exam" / "truth"
+TRUTH = Path(__file__).parents[1] / "exam" / "truth"
 FEW = "effect=[viscous_friction,coulomb_friction,input_delay]"
 QUICK = (
     "method.steps=100",

@@ -26,7 +26,7 @@ from tests.exam.twins import apart, twins
 from tests.exam.visible import visible
 from tests.exam.write import write
 
-EXAM = Path(__file__).parent / "exam"
+EXAM = Path(__file__).parents[1] / "exam"
 GENERATOR = (
     "plants",
     "formulas",
@@ -74,7 +74,6 @@ def test_the_generator_knows_nothing_of_the_tool() -> None:
 def test_the_tool_gets_the_same_equations_and_ranges(name: str) -> None:
     system, random = SYSTEMS[name], np.random.default_rng(0)
     node = yaml.safe_load((EXAM / "nominal" / f"{name}.yaml").read_text())
-    node.pop("_target_")
     model = Declared(**node).model()
     assert tuple(q.name for q in model.states) == system.states
     assert tuple(q.name for q in model.inputs) == system.inputs
@@ -428,7 +427,7 @@ def test_of_the_columns_of_an_effect_those_that_fit_best_are_kept(key: str, at: 
     assert len({(c.effect, c.acts_on) for c in kept}) == len(kept) - 1
 
 
-@pytest.mark.slow  # tests/test_discover.py finds one from end to end
+@pytest.mark.slow  # tests/discovery/test_discover.py finds one from end to end
 def test_a_strong_effect_is_found_in_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(CACHE))
     folder, file = places(tmp_path, 0)

@@ -105,7 +105,7 @@ def test_evaluate(folder: Path, fitted: tuple[Path, str]) -> None:
     assert after == before  # the same measurements, the same split
 
 
-@pytest.mark.slow  # tests/test_sweep.py tests sweeps
+@pytest.mark.slow  # tests/sweeps/test_sweep.py tests sweeps
 def test_sweep(folder: Path) -> None:
     (command,) = commands("sweep")
     argv = words(command, **{"range(3)": "range(1)"})

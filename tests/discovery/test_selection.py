@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_aliases import searched
+from tests.test_swings import pushed
 
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
@@ -22,8 +24,6 @@ from simpel_cli.discovery.search.selection import cut, further, select
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
-from tests.test_swings import pushed
-from tests.test_twins import searched
 
 
 class MadeUp:

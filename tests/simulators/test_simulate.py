@@ -14,7 +14,7 @@ from simulators.worlds.mujoco_world import MujocoWorld
 from simulators.worlds.rk4 import RK4
 from simulators.worlds.simulate import Simulate
 
-CONF = Path(__file__).parents[1] / "conf" / "sim"
+CONF = Path(__file__).parents[2] / "conf" / "sim"
 U = Quantity("u", "V", -1.0, 3.0)
 
 

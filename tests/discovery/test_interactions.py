@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_discovery_filter import DT, LOAD, model, recording
+from test_filter import DT, LOAD, model, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.coordinates import CUT

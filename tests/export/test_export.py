@@ -16,7 +16,7 @@ from command_line import FIT, TINY, rig, simpel
 
 from simpel_cli.config import nodes
 from simpel_cli.config.places import conf_dir
-from simpel_cli.config.resolved import GROUPS, load
+from simpel_cli.config.resolved import load
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators.model import Model
 from simulators.step import one_step
@@ -160,12 +160,12 @@ def test_numpy_predicts_what_the_posterior_does(fitted: Path, tmp_path: Path) ->
     assert found["std"]["omega"] == pytest.approx((following[:, 1].var() + noise[2] ** 2) ** 0.5, rel=1e-4)
 
 
-def test_the_simulator_that_discover_corrected(tmp_path: Path) -> None:
+def test_the_simulator_that_discover_corrected(fitted: Path, tmp_path: Path) -> None:
     run = tmp_path / "found"
     (run / "conf" / "sim").mkdir(parents=True)
     my = rig(tmp_path)
     cart = load(my / "sim" / "cart.yaml")
-    (run / "config.yaml").write_text(json.dumps({group: {} for group in GROUPS} | {"sim": cart}))
+    (run / "config.yaml").write_text(json.dumps(load(fitted / "config.yaml") | {"sim": cart}))
     (run / "manifest.json").write_text(json.dumps({"command": "discover", "status": "done"}))
     (run / "conf" / "sim" / "cart_with_leak.yaml").write_text(
         json.dumps(cart | {"name": "cart_with_leak", "parameters": cart["parameters"] | {"b": {"range": [0.1, 0.3]}}})

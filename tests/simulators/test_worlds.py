@@ -16,7 +16,7 @@ from simulators.worlds import compiled_world
 from simulators.worlds.compiled_world import CompiledWorld
 from simulators.worlds.mujoco_world import MujocoWorld
 
-PENDULUM = Path(__file__).parents[1] / "conf" / "sim" / "pendulum_world.yaml"
+PENDULUM = Path(__file__).parents[2] / "conf" / "sim" / "pendulum_world.yaml"
 G = 9.81
 AIR, RADIUS = 1.2, 0.18  # kg/m^3, m: the ball of pendulum.xml
 SIZES = [(1.0, 1.0, 1.0), (0.6, 1.4, 1.1), (1.4, 0.55, 0.85)]  # m, l, C_m

@@ -109,7 +109,6 @@ CASES = [
          "prior.gap.kernel._target_", "Did you mean Matern52?", "SquaredExponential"),
     case("score as method", "fit method._target_=simpel_cli.scores.gaussian.Gaussian", CONFIG, "is no method"),
     case("removed _target_", "fit ~method._target_", CONFIG, "method: the key _target_ is missing"),
-    sim("missing _target_", "_target_: simulators.model.Declared\n", "", "sim: the key _target_ is missing"),
     sim("target os.system", "simulators.model.Declared", "os.system", "sim._target_: got os.system",
         "allowed are classes of simpel_cli, simulators"),
     sim("target read_pickle", "simulators.model.Declared", "pandas.read_pickle", "got pandas.read_pickle"),

@@ -12,7 +12,7 @@ from simpel_cli.config.nodes import build
 from simulators.parameters import draw
 from simulators.worlds.compiled_world import CompiledWorld
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 MEASURED = ["x", "y", "theta", "vx", "vy", "omega"]
 WHEELS = ["front_left", "front_right", "rear_left", "rear_right"]
 G, L_F, L_R, TRACK, RADIUS = 9.81, 0.13, 0.17, 0.2, 0.035  # m/s^2, m

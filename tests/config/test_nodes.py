@@ -120,7 +120,9 @@ class TestBuild:
         assert made.width == 3.0
 
     def test_role_of_a_group(self) -> None:
-        with pytest.raises(ConfigError, match=r"sim\._target_: simpel_cli\.priors\.gaussian_process\.Matern32 is no sim"):
+        with pytest.raises(
+            ConfigError, match=r"sim\._target_: simpel_cli\.priors\.gaussian_process\.Matern32 is no sim"
+        ):
             build({"_target_": "simpel_cli.priors.gaussian_process.Matern32"}, "sim")
 
 

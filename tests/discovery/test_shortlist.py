@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from test_aliases import searched
 
 from simpel_cli.discovery.likelihood.latent_force import Force
 from simpel_cli.discovery.search import shortlist as module
 from simpel_cli.discovery.search.setup import key_of
 from simpel_cli.discovery.search.shortlist import shortlist
-from tests.test_twins import searched
 
 
 @pytest.mark.parametrize(("force", "name"), [("drag", "drag"), ("load", "load"), ("input", None)])
