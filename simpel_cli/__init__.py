@@ -10,8 +10,8 @@ def _without_wrong_fusions() -> None:
     """Switch off the fusions with which jaxlib 0.10.2 to 0.12 silently computes wrong results on CPU (see jax-ml/jax#39103).
 
     Conjugate gradients with a matrix-valued operator came out wrong in 18 of 40 compilations, NaN or off by 1e100
-    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Must run before JAX opens its backend; flags of the user's that name
-    the same switch, or a file, are left alone. Later versions may not know the switch, and would not start with it.
+    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Must run before JAX opens its backend; flags of the user's
+    that name the same switch, or a file, are left alone. Later versions may not know the switch, and would not start with it.
     """
     try:
         found = tuple(int(part) for part in version("jaxlib").split(".")[:2])

@@ -35,7 +35,9 @@ def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch)
         {q.name: 1.0 for q in (*model.states, *model.inputs)}, {q.name: 2.0 for q in model.states}, model.dt
     )
     names = [q.name for q in model.states]
-    terms: list[Term] = [build(node_of("effect", e), "effect").attach(model, scales, tuple(names[:1]))[0] for e in effects]
+    terms: list[Term] = [
+        build(node_of("effect", e), "effect").attach(model, scales, tuple(names[:1]))[0] for e in effects
+    ]
     knobs = [k for t in terms for k in t.knobs]
     rows = [[knobs.index(k) for k in t.knobs] for t in terms]
     point = {i: dict.fromkeys(("value", "low", "high"), k.starts[0]) for i, k in enumerate(knobs)}

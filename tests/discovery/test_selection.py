@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_aliases import searched
-from tests.test_swings import pushed
+from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
