@@ -53,7 +53,7 @@ class Built(Declared, ABC):
 
 
 def symbols_in(formula: str) -> set[str]:
-    """Return the names in a formula, none if it cannot be read: that is told where it is used."""
+    """Return the names in a formula, none if it cannot be read: the message comes where it is used."""
     try:
         return symbols_used(formula)
     except ExpressionError:

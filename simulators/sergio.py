@@ -1,4 +1,4 @@
-"""Expression of genes in single cells: Hill kinetics of a regulatory network, told by mean and spread of every gene.
+"""Expression of genes in single cells: Hill kinetics of a regulatory network, described by mean and spread of every gene.
 
     dX_cg/dt = b_g + sum_r |K_rg| M_rg H_rg(X_cr) - lambda_g X_cg
     H_rg = u_r where K_rg > 0, else 1 - u_r,   u_r = X_cr^p/(h_r^p + X_cr^p),   h_r = mean_c X_cr
@@ -121,8 +121,8 @@ class Sergio:
 
         def rates(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
             z, q = casadi.MX.sym("z", coordinates.size), casadi.MX.sym("q", p.numel())
-            told = casadi.Function("told", [z, q], [casadi.jtimes(self._leave(z, q), z, self._cells_rate(z, u, q))])
-            return told(self._enter(x, p), p)
+            pushed = casadi.Function("pushed", [z, q], [casadi.jtimes(self._leave(z, q), z, self._cells_rate(z, u, q))])
+            return pushed(self._enter(x, p), p)
 
         return Model(
             name=self.name,

@@ -83,7 +83,7 @@ def launch(
             if config_dir is not None and "choices" in plain:
                 plain["choices"]["config_dir"] = str(config_dir)  # for the commands that a run ends with
             given = [w.removeprefix("++") for w in hydra_config.overrides.task]
-            told = " ".join(w for w in given if w.partition("=")[0] in swept)
+            chosen = " ".join(w for w in given if w.partition("=")[0] in swept)
             sweep = launching = None
             if hydra_config.mode is not None and hydra_config.mode.name == "MULTIRUN":
                 sweep = Path(hydra_config.sweep.dir).absolute()
@@ -93,7 +93,7 @@ def launch(
                     plain,
                     directory,
                     folder,
-                    told,
+                    chosen,
                     tuple(given),
                     "fit" if verb == "sweep" else verb,
                     sweep,

@@ -18,18 +18,18 @@ from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
-from simpel_cli.discovery.search.disturbances import Swing, swing
+from simpel_cli.discovery.search.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.gate import Gate
-from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import setup, terms_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.verdict.corrected import corrected
-from simpel_cli.discovery.verdict.evidence import exhibits
+from simpel_cli.discovery.verdict.evidence import evidence_tables
 from simpel_cli.discovery.verdict.remainder import remainder_of
-from simpel_cli.discovery.verdict.undetectable import caveats, unseen
+from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.errors import ConfigError, Inconclusive
 from simpel_cli.runs.console import Terminal
@@ -63,7 +63,7 @@ class Searched(NamedTuple):
     assessor: Assessor
     selection: Selection
     gates: list[Gate]
-    disturbance: Swing | None
+    disturbance: Disturbance | None
     windows: Windows
     recording: Recording
 
@@ -111,7 +111,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     if found["effects"]:
         found |= _correct(declared, searched, found, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
-    shown = exhibits(search, selection, assessor, searched.recording, searched.windows, before, after)
+    shown = evidence_tables(search, selection, assessor, searched.recording, searched.windows, before, after)
     for name, table in shown.items():
         write_table(directory / f"{name}.parquet", table.columns, table.units)
     publish(terminal, found, directory, declared.config)
@@ -138,15 +138,15 @@ def _search(study: Study, terminal: Terminal) -> Searched:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
     plan = attach(kept=shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal))
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
     assessor = Assessor(plan, options.horizon)
     search, base, windows, clean = calibrated(plan, fitter, assessor, clean, terminal)
     outliers = outlier_check(clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     selection, gates = accepted(search, assessor, base, options, terminal)
-    levels = Levels(search, assessor, selection.chosen)
+    levels = NoiseProfile(search, assessor, selection.chosen)
     selection, gates = with_interactions(levels, selection, gates, attach, options, terminal)
-    disturbance = None if selection.remainder else swing(levels)
+    disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
     recording = recording._replace(checks=(*recording.checks, outliers))
@@ -161,7 +161,7 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, seconds:
         search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
     )
     found["steps"] = steps_of(search, selection, assessor, windows)
-    found["not_tested"] = unseen(search, selection.chosen, recording.train)
+    found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
     found["summary"] += caveats(found)
@@ -186,11 +186,11 @@ def _correct(
         file.parent.mkdir(parents=True)
         write_text(file, content)
     after = declared.changed(sim=node)
-    told: dict[str, Any] = {
+    added: dict[str, Any] = {
         "corrected_sim": str(path.relative_to(directory)),
         "corrected_sim_lacks": left_out,
         "stack_actions": past_inputs(after.source),
     }
     if config.get("close", True) and len(left_out) < len(found["effects"]):
-        told["as_prior"] = close(declared, after, directory, data_folder, terminal)
-    return told
+        added["as_prior"] = close(declared, after, directory, data_folder, terminal)
+    return added

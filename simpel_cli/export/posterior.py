@@ -30,7 +30,7 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
     Raises:
         ConfigError: the checkpoint is damaged, or the method has something other than networks.
     """
-    leaves, facts = load_checkpoint(folder / "checkpoint")
+    leaves, kept = load_checkpoint(folder / "checkpoint")
     root = next((root for root in NETWORKS if f"{root}.particles[0][0]" in leaves), None)
     if root is None:
         raise ConfigError(
@@ -48,7 +48,7 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
         arrays[f"kernel_{i}"] = leaves[f"{root}.particles[{i}][0]"][index]
         arrays[f"bias_{i}"] = leaves[f"{root}.particles[{i}][1]"][index]
     encoding = _encoding(declared, len(scale["y_mean"]))
-    told = {
+    facts = {
         "format": "simpel posterior 1",
         "dt": declared.source.dt,
         "states": [{"name": q.name, "unit": q.unit, "angle": q.periodic} for q in encoding.states],
@@ -63,10 +63,10 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
         ],
         "networks": len(arrays["bias_0"]),
         "seed": declared.settings.all_seeds[index],
-        "step": facts.get("step"),
+        "step": kept.get("step"),
     }
     write_arrays(into / "posterior.safetensors", {name: np.asarray(a, np.float32) for name, a in arrays.items()}, {})
-    write_text(into / "posterior.json", json.dumps(told, indent=1))
+    write_text(into / "posterior.json", json.dumps(facts, indent=1))
     shutil.copyfile(Path(predictor.__file__), into / "predictor.py")
 
 
@@ -79,4 +79,4 @@ def _encoding(declared: Declared, width: int) -> Encoding:
         )
         if encoding.dim_y == width:
             return encoding
-    raise ConfigError(f"sim.outputs: which of them the networks predict cannot be told from {width} targets.")
+    raise ConfigError(f"sim.outputs: which of them the networks predict cannot be known from {width} targets.")

@@ -39,7 +39,7 @@ def write_simulator(into: Path, model: Model, sim: dict[str, Any], values: Mappi
 
 
 def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
-    def told(group: tuple[Any, ...]) -> list[dict[str, Any]]:
+    def described(group: tuple[Any, ...]) -> list[dict[str, Any]]:
         return [
             {"name": q.name, "unit": q.unit, "angle": q.periodic, "low": _finite(q.low), "high": _finite(q.high)}
             for q in group
@@ -61,13 +61,13 @@ def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
         "function": f"{model.name}_step",
         "signature": "(x, u, p) -> (next, y), columns",
         "dt": model.dt,
-        "x": told(model.states),
-        "u": told(model.inputs),
+        "x": described(model.states),
+        "u": described(model.inputs),
         "past_inputs": model.past(),
         "u_order": "inputs of the past_inputs steps before and of this one, oldest first",
         "p": parameters,
         "next": "x one dt later; an angle is not wrapped",
-        "y": told(model.outputs),
+        "y": described(model.outputs),
         "known": model.fixed,
     }  # fmt: skip
 

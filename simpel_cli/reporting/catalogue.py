@@ -95,8 +95,8 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     terminal.line(f"{model.dt:g} s per transition, {getattr(model, 'substeps', 1)} substeps", "step")
     late = getattr(model, "delay", {}) | {f"{k} (lag)": v for k, v in getattr(model, "lag", {}).items()}
     if late:
-        told = ", ".join(f"{k} {v} s" if isinstance(v, float) else f"{k} {v}" for k, v in late.items())
-        terminal.line(told, "late")
+        delays = ", ".join(f"{k} {v} s" if isinstance(v, float) else f"{k} {v}" for k, v in late.items())
+        terminal.line(delays, "late")
     for group in ("states", "inputs", "params", "outputs"):
         quantities = getattr(model, group, ())
         if quantities:
@@ -144,9 +144,9 @@ def _show_effect(terminal: Terminal, entry: Entry) -> None:
     terminal.line(
         "A, V, S, X, U, Y, W, Q: largest rate, velocity, ... of what it acts on, from your data; dt: of the rows."
     )
-    for key, told in (("same_as", "no data tell it from"), ("generalises", "becomes, by its parameters")):
+    for key, meaning in (("same_as", "cannot be distinguished from"), ("generalises", "becomes, by its parameters")):
         if node.get(key):
-            terminal.line(f"{told}: {_words(node[key])}")
+            terminal.line(f"{meaning}: {_words(node[key])}")
 
 
 def _entries(group: str, config_dir: Path | None) -> list[Entry]:

@@ -109,8 +109,8 @@ def _read(found: Sequence[Found]) -> tuple[list[Run], list[Found]]:
                 unread.append(each)
     if not runs:
         states = Counter(each.status or "not begun" for each in found)
-        told = ", ".join(f"{count} {state}" for state, count in states.items())
-        raise ConfigError(f"report: of {len(found)} runs none is done with metrics that can be read ({told}).")
+        counted = ", ".join(f"{count} {state}" for state, count in states.items())
+        raise ConfigError(f"report: of {len(found)} runs none is done with metrics that can be read ({counted}).")
     panels = distinct(run.panel for run in runs)
     return [run for panel in panels for run in _apart([run for run in runs if run.panel == panel])], unread
 

@@ -200,9 +200,9 @@ class Comparison:
         counts: Counter[tuple[str, str, str]] = Counter()
         for run in self.runs:
             with contextlib.suppress(OSError, ValueError, AttributeError):
-                told = json.loads((run.found.directory / "verdict.json").read_text())
-                effects = ", ".join(str(e.get("name", "")) for e in told.get("effects") or [])
-                counts[run.variant, str(told.get("verdict")), effects or "-"] += 1
+                found = json.loads((run.found.directory / "verdict.json").read_text())
+                effects = ", ".join(str(e.get("name", "")) for e in found.get("effects") or [])
+                counts[run.variant, str(found.get("verdict")), effects or "-"] += 1
         if not counts:
             return []
         rows = [(*key, str(count)) for key, count in sorted(counts.items(), key=lambda item: (item[0][0], -item[1]))]

@@ -230,7 +230,7 @@ def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
         "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
         "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
         "rows": rows,
-        "note": "With 90 % intervals. One whose interval fills its range is not told by these data"
+        "note": "With 90 % intervals. One whose interval fills its range is not determined by these data"
         + ("; one that moves far was making up for what the simulator lacked." if found["effects"] else "."),
     }
 
@@ -271,7 +271,7 @@ def not_found_section(found: Mapping[str, Any]) -> Section:
     after = ""
     if rest:
         names = ", ".join(f"{words(e['name'])} on {e['acts_on']}" for e in rest)
-        after = f"Left as hopeless before their fits came to rest, so that no size can be stated: {names}."
+        after = f"Stopped early, since they could not have earned enough evidence; their size is not known: {names}."
     return {
         "title": "What was not found, and how small it must be",
         "head": ["effect", "parameter", "smaller than", "gain in evidence"],

@@ -29,12 +29,12 @@ class Finding(NamedTuple):
     Args:
         what: was looked at.
         state: ok, look (it will do, but see), or wrong (do not trust results).
-        told: what was found, and the cure.
+        detail: what was found, and the cure.
     """
 
     what: str
     state: str
-    told: str
+    detail: str
 
 
 def doctor() -> None:
@@ -46,7 +46,7 @@ def doctor() -> None:
     terminal = Terminal(quiet=False)
     began = perf_counter()
     found = [*_surroundings(), *(_tested(what, test) for what, test in TESTS.items())]
-    terminal.line(aligned((), [(f.what, MARKS[f.state], f.told) for f in found]))
+    terminal.line(aligned((), [(f.what, MARKS[f.state], f.detail) for f in found]))
     terminal.line()
     wrong = [f.what for f in found if f.state == "wrong"]
     if wrong:
@@ -75,10 +75,10 @@ def _device() -> Finding:
     import jax
 
     device = configure(Settings())
-    told = f"{device.device_kind or device.platform} ({jax.default_backend()}), {len(jax.devices())} of them"
+    detail = f"{device.device_kind or device.platform} ({jax.default_backend()}), {len(jax.devices())} of them"
     if device.platform == "cpu" and shutil.which("nvidia-smi"):
-        return Finding("device", "look", f"{told}; there is a GPU that JAX does not use: install jax[cuda13]")
-    return Finding("device", "ok", told)
+        return Finding("device", "look", f"{detail}; there is a GPU that JAX does not use: install jax[cuda13]")
+    return Finding("device", "ok", detail)
 
 
 def _threads() -> Finding:
@@ -122,10 +122,10 @@ def _recordings() -> Finding:
 def _tested(what: str, test: Callable[[], tuple[bool, str]]) -> Finding:
     began = perf_counter()
     try:
-        good, told = test()
+        good, detail = test()
     except Exception as error:  # whatever fails here is what the doctor is asked for
-        good, told = False, f"{type(error).__name__}: {str(error).splitlines()[0]}"
-    return Finding(what, "ok" if good else "wrong", f"{told} ({perf_counter() - began:.1f} s)")
+        good, detail = False, f"{type(error).__name__}: {str(error).splitlines()[0]}"
+    return Finding(what, "ok" if good else "wrong", f"{detail} ({perf_counter() - began:.1f} s)")
 
 
 def _simulator() -> tuple[bool, str]:

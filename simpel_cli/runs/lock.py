@@ -9,7 +9,7 @@ from simpel_cli.errors import ConfigError
 
 try:
     import fcntl
-except ImportError:  # Windows: two processes in one directory are not told apart there
+except ImportError:  # Windows: two processes in one directory are not detected there
     fcntl = None  # type: ignore[assignment]
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import casadi
 
 from simulators.effects.structure import structure
-from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR, Knob, Term
+from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR, EffectParameter, Term
 from simulators.effects.vehicle import PARTS, Vehicle, vehicle
 from simulators.expression import RESERVED, parse
 from simulators.model import Model, ModelError
@@ -184,10 +184,10 @@ class Expression:
             values["S"] = 3.141592653589793
         found = []
         for other in others:
-            knobs = self._knobs(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
-            swap = own | {role: other} | {k.label: k.name for k in knobs}
+            parameters = self._parameters(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
+            swap = own | {role: other} | {k.label: k.name for k in parameters}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
-            found.append(self._term(name, kind, text, knobs))
+            found.append(self._term(name, kind, text, parameters))
         return found
 
     def _on_vehicle(self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales) -> list[Term]:
@@ -207,21 +207,21 @@ class Expression:
             values["Q"], unit_of["Q"] = max(scales.rate[s] for s in turn), "rad/s^2"
         states = [q.name for q in model.states if any(q.name in car.parts[part] for part in own)]
         used = set().union(*(_names(text) for text in own.values()))
-        knobs = self._knobs("_".join([self.name, *states]), values, unit_of, used)
-        swap = car.names | {k.label: k.name for k in knobs}
+        parameters = self._parameters("_".join([self.name, *states]), values, unit_of, used)
+        swap = car.names | {k.label: k.name for k in parameters}
         sums: dict[str, list[str]] = {state: [] for state in states}
         for part, text in own.items():
             for state, factor in car.parts[part].items():
                 push = f"({_renamed(text, swap)})"
                 sums[state].append(push if factor == "1" else f"{factor}*{push}")
         several = tuple((state, " + ".join(terms)) for state, terms in sums.items())
-        return [self._term(", ".join(states), RATE, "", knobs, several)]
+        return [self._term(", ".join(states), RATE, "", parameters, several)]
 
-    def _knobs(
+    def _parameters(
         self, prefix: str, values: Mapping[str, float], unit_of: Mapping[str, str], used: set[str] | None = None
-    ) -> tuple[Knob, ...]:
+    ) -> tuple[EffectParameter, ...]:
         """Return the parameters, or those that are used, in the scales of a place."""
-        knobs = []
+        parameters = []
         for label, node in self.parameters.items():
             if used is not None and label not in used:
                 continue
@@ -229,16 +229,24 @@ class Expression:
             null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
             given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
             starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
-            knobs.append(
-                Knob(f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts)
+            parameters.append(
+                EffectParameter(
+                    f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts
+                )
             )
-        return tuple(knobs)
+        return tuple(parameters)
 
     def _term(
-        self, name: str, kind: str, text: str, knobs: tuple[Knob, ...], several: tuple[tuple[str, str], ...] = ()
+        self,
+        name: str,
+        kind: str,
+        text: str,
+        parameters: tuple[EffectParameter, ...],
+        several: tuple[tuple[str, str], ...] = (),
     ) -> Term:
         return Term(
-            self.name, name, kind, text, knobs, self.meaning, tuple(self.same_as), tuple(self.generalises), self.dissipative,
+            self.name, name, kind, text, parameters, self.meaning, tuple(self.same_as), tuple(self.generalises),
+            self.dissipative,
             several=several,
         )  # fmt: skip
 

@@ -10,7 +10,7 @@ ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
 OPERATORS = (*ON_INPUT, *ON_SENSOR)
 
 
-class Knob(NamedTuple):
+class EffectParameter(NamedTuple):
     """One unknown parameter of an effect, in the model's units.
 
     At `neutral` the effect is switched off: the model is what it was without it.
@@ -34,12 +34,12 @@ class Term(NamedTuple):
         acts_on: the state whose rate it changes, the input or the measured quantity that it alters; of a term on several
             rates their states, separated by commas.
         kind: RATE, INPUT, SENSOR or one of OPERATORS.
-        expression: in the names of the model and of the knobs; empty for operators and for terms on several rates. RATE
+        expression: in the names of the model and of the parameters; empty for operators and for terms on several rates. RATE
             adds it to the rate; INPUT and SENSOR put it in place of the quantity.
-        knobs: its parameters.
+        parameters: its parameters.
         meaning: one physical sentence.
         same_as: names of effects that no data can tell from this one.
-        generalises: effects that it becomes when some of its knobs are neutral.
+        generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy.
         depends_on: arguments of a function without a physical name; empty for named effects.
         constants: numbers of the expression that were read off the measurements, by name; programs take them as
@@ -51,7 +51,7 @@ class Term(NamedTuple):
     acts_on: str
     kind: str
     expression: str
-    knobs: tuple[Knob, ...]
+    parameters: tuple[EffectParameter, ...]
     meaning: str
     same_as: tuple[str, ...] = ()
     generalises: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from numpy.polynomial import chebyshev, polynomial
 
 from simulators.effects.expression import Scales, per
 from simulators.effects.structure import structure
-from simulators.effects.term import RATE, Knob, Term
+from simulators.effects.term import RATE, EffectParameter, Term
 from simulators.model import Model
 
 BASES = 6
@@ -39,14 +39,16 @@ def unnamed(model: Model, scales: Scales, *, pairs: bool = False) -> list[Term]:
             turns = argument in periodic
             size = (f"size_of_{argument}", scales.size[argument])
             waves, shares = _harmonics(argument) if turns else _sines(argument, size[0])
-            knobs = tuple(
-                Knob(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
+            parameters = tuple(
+                EffectParameter(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
                 for j, sd in enumerate((amplitude * share for share in shares), start=1)
             )
-            text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(knobs, waves, strict=True))
+            text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(parameters, waves, strict=True))
             meaning = f"some function of {argument}"
             constants = () if turns else (size,)
-            terms.append(Term("unnamed", name, RATE, text, knobs, meaning, depends_on=(argument,), constants=constants))
+            terms.append(
+                Term("unnamed", name, RATE, text, parameters, meaning, depends_on=(argument,), constants=constants)
+            )
     if pairs and len(arguments) <= MOST_ARGUMENTS:
         terms += functions_of_two(model, scales)
     return terms
@@ -69,20 +71,31 @@ def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> lis
     for a, b in combinations((*states, *inputs), 2):
         if a not in states:
             continue
-        knobs, sums = [], []
+        parameters, sums = [], []
         for j, (wave, share) in enumerate(bases[a], start=1):
             row = []
             for k, (other, other_share) in enumerate(bases[b], start=1):
                 label, sd = f"w{j}{k}", AMPLITUDE * scales.rate[name] * share * other_share
-                knobs.append(
-                    Knob(f"unnamed_{name}_of_{a}_{b}_{label}", label, unit, -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
+                parameters.append(
+                    EffectParameter(
+                        f"unnamed_{name}_of_{a}_{b}_{label}", label, unit, -2 * sd, 2 * sd, 0.0, (0.0,), "normal"
+                    )
                 )
-                row.append(f"{knobs[-1].name}*{other}")
+                row.append(f"{parameters[-1].name}*{other}")
             sums.append(f"{wave}*({' + '.join(row)})")
         constants = tuple((f"size_of_{c}", scales.size[c]) for c in (a, b) if c not in periodic)
         meaning = f"some function of {a} and {b}"
         terms.append(
-            Term("unnamed", name, RATE, " + ".join(sums), tuple(knobs), meaning, depends_on=(a, b), constants=constants)
+            Term(
+                "unnamed",
+                name,
+                RATE,
+                " + ".join(sums),
+                tuple(parameters),
+                meaning,
+                depends_on=(a, b),
+                constants=constants,
+            )
         )
     return terms
 

@@ -1,4 +1,4 @@
-"""Whether a model is a vehicle that is steered in the plane, and how its forces are told along its own axes.
+"""Whether a model is a vehicle that is steered in the plane, and how its forces are expressed along its own axes.
 
     long = vx cos(theta) + vy sin(theta),    lat = vy cos(theta) - vx sin(theta),    yaw = d(theta)/dt
     d(long)/dt = d(vx)/dt cos(theta) + d(vy)/dt sin(theta) + yaw lat

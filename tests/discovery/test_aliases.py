@@ -10,7 +10,7 @@ from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.fit import Fitter, Optimum
 from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.verdict.aliases import twins
+from simpel_cli.discovery.verdict.aliases import are_aliases
 from simulators.effects import Expression
 from simulators.model import Declared
 
@@ -23,7 +23,7 @@ EFFECTS = [
 
 def searched(gain: str, effects: Sequence[Expression] = EFFECTS) -> Search:
     model = Declared(
-        "lane", dt=0.1,
+        "hypothesis", dt=0.1,
         states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-3, 3]}},
         inputs={"u": {"unit": "V", "range": [-3, 3]}},
         parameters={"b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
@@ -38,7 +38,7 @@ def searched(gain: str, effects: Sequence[Expression] = EFFECTS) -> Search:
     )
     recording = Recording(episodes[:3], episodes[3:], (), {"s": 0.1, "v": 0.1}, (), (Check("c", True, ""),), ())
     plan = setup(model, recording, (), effects, 1)
-    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=1, width=12))
+    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=1, width=12))
 
 
 def fitted(search: Search, name: str, value: float) -> tuple[int, Trial]:
@@ -54,6 +54,6 @@ def fitted(search: Search, name: str, value: float) -> tuple[int, Trial]:
 def test_an_offset_is_a_load_where_the_input_enters_with_a_constant_gain(gain: str, same: bool) -> None:
     search = searched(gain)
     load, offset, drag = (fitted(search, name, 0.4) for name in ("load", "offset", "drag"))
-    assert twins(search, load[1], load, offset) is same
-    assert not twins(search, load[1], load, drag)
-    assert twins(search, load[1], load, fitted(search, "load", 0.2))
+    assert are_aliases(search, load[1], load, offset) is same
+    assert not are_aliases(search, load[1], load, drag)
+    assert are_aliases(search, load[1], load, fitted(search, "load", 0.2))

@@ -38,9 +38,9 @@ def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch)
     terms: list[Term] = [
         build(node_of("effect", e), "effect").attach(model, scales, tuple(names[:1]))[0] for e in effects
     ]
-    knobs = [k for t in terms for k in t.knobs]
-    rows = [[knobs.index(k) for k in t.knobs] for t in terms]
-    point = {i: dict.fromkeys(("value", "low", "high"), k.starts[0]) for i, k in enumerate(knobs)}
+    parameters = [k for t in terms for k in t.parameters]
+    rows = [[parameters.index(k) for k in t.parameters] for t in terms]
+    point = {i: dict.fromkeys(("value", "low", "high"), k.starts[0]) for i, k in enumerate(parameters)}
     monkeypatch.setattr(module, "interval_of", lambda search, trial, row, z: point[row])
     # the order in which terms were accepted is not that in which they were attached
     search = Search.__new__(Search)
@@ -55,18 +55,19 @@ def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch)
 def test_the_yaml_has_the_rates_that_were_fitted(sim: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, terms, new, left_out = written(sim, CASES[sim], monkeypatch)
     together = augment(model, terms, [q.name for q in model.states])
-    random, knobs = np.random.default_rng(0), [k.starts[0] for t in terms for k in t.knobs]
+    random, parameters = np.random.default_rng(0), [k.starts[0] for t in terms for k in t.parameters]
     assert left_out == []
     for term in terms:
         if term.kind == "delay":
-            assert new.fixed[new.delay[term.acts_on]] == term.knobs[0].starts[0]
+            assert new.fixed[new.delay[term.acts_on]] == term.parameters[0].starts[0]
     changed = 0.0
     for _ in range(10):
         x, u, p = (
             [random.uniform(q.low, q.high) for q in group] for group in (model.states, model.inputs, model.params)
         )
         fitted, old = (
-            np.asarray(f(x, u, q)[0]).ravel() for f, q in ((together.function, [*p, *knobs]), (model.function(), p))
+            np.asarray(f(x, u, q)[0]).ravel()
+            for f, q in ((together.function, [*p, *parameters]), (model.function(), p))
         )
         np.testing.assert_allclose(np.asarray(new.function()(x, u, p)[0]).ravel(), fitted, rtol=1e-9, atol=1e-9)
         changed = max(changed, float(np.abs(fitted - old).max()))

@@ -12,9 +12,9 @@ from test_interactions import FRICTION, NOISE, ROWS
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.search.disturbances import Swing, _evidence, _told, swing
+from simpel_cli.discovery.search.disturbances import Disturbance, _evidence, _statistics, time_dependent_disturbance
 from simpel_cli.discovery.search.errors_ahead import Assessor
-from simpel_cli.discovery.search.noise_profile import Level, Levels, evidence
+from simpel_cli.discovery.search.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.discovery.search.selection import Selection, select
 from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
@@ -63,7 +63,7 @@ def glider() -> Model:
     ).model()  # fmt: skip
 
 
-def pushed(force: Callable[[float, float, float], float], shaken: float, seed: int) -> Levels:
+def pushed(force: Callable[[float, float, float], float], shaken: float, seed: int) -> NoiseProfile:
     """Search episodes of dv/dt = 1.3 u - 0.7 v + force(t, phase, v), each with its own phase, by a simulator without it."""
     random, fine, episodes = np.random.default_rng(seed), 20, []
     for k in range(5):
@@ -82,19 +82,19 @@ def pushed(force: Callable[[float, float, float], float], shaken: float, seed: i
     checks = (Check("c", True, ""),)
     data = Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"s": NOISE, "v": NOISE}, (), checks, ())
     plan = setup(glider(), data, (), [FRICTION], 2)
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
-    return Levels(search, Assessor(plan, 10), select(search).chosen)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=10))
+    return NoiseProfile(search, Assessor(plan, 10), select(search).chosen)
 
 
-def select_nothing(levels: Levels) -> Selection:
+def select_nothing(levels: NoiseProfile) -> Selection:
     return Selection(levels.chosen, levels.chosen, (levels.chosen,), (), (), (), None)
 
 
-def said(levels: Levels, found: Swing) -> dict[str, Any]:
+def said(levels: NoiseProfile, found: Disturbance) -> dict[str, Any]:
     learnt = levels.assessor(levels.chosen.optimum.z, levels.search.plan.windows)
-    told = remainder_of(levels.search, select_nothing(levels), found, learnt)
-    assert told is not None
-    return told
+    remainder = remainder_of(levels.search, select_nothing(levels), found, learnt)
+    assert remainder is not None
+    return remainder
 
 
 def test_evidence_of_windows_is_that_of_the_dense_equations() -> None:
@@ -111,7 +111,7 @@ def test_evidence_of_windows_is_that_of_the_dense_equations() -> None:
         0.0, track, error.reshape(shape), error.reshape(shape), known.reshape(*shape, unknowns), np.ones(shape)
     )
     sizes = np.array([0.3, 2.0])
-    found, weights = _evidence(_told(level, columns), sizes)
+    found, weights = _evidence(_statistics(level, columns), sizes)
     for f in range(frequencies):
         dense = np.zeros((count, rows, count, 2))
         dense[np.arange(count), :, np.arange(count)] = columns[..., f]
@@ -125,15 +125,15 @@ def test_evidence_of_windows_is_that_of_the_dense_equations() -> None:
 @pytest.mark.parametrize("shaken", [0.0, 0.2])
 def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
     levels = pushed(lambda t, phase, _: 0.5 * np.sin(2 * np.pi * t / PERIOD + phase), shaken, 0)
-    found = swing(levels)
+    found = time_dependent_disturbance(levels)
     assert found is not None
     assert found.acts_on == "v"
     assert found.period == pytest.approx(PERIOD, rel=0.1)
     assert found.rms == pytest.approx(0.5 / np.sqrt(2), rel=0.35)
-    told = said(levels, found)
-    assert (told["depends_on"], told["period"], told["unit"]) == (["time"], found.period, "m/s^2")
-    assert f"with a period of about {found.period:.3g} s" in told["description"]
-    assert "as u does" not in told["description"]
+    remainder = said(levels, found)
+    assert (remainder["depends_on"], remainder["period"], remainder["unit"]) == (["time"], found.period, "m/s^2")
+    assert f"with a period of about {found.period:.3g} s" in remainder["description"]
+    assert "as u does" not in remainder["description"]
     # an input that swings in the same time is named
     windows = levels.search.plan.windows
     wave = np.sin(2 * np.pi * DT / found.period * np.arange(windows.u.shape[1]))[None, :, None]
@@ -147,21 +147,21 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
 
 @pytest.mark.parametrize("correlation", [0.3, 1.0])
 def test_a_force_that_wanders_has_no_period(correlation: float) -> None:
-    found = swing(pushed(wandering(correlation, 1.0, 5), 0.0, 3))
+    found = time_dependent_disturbance(pushed(wandering(correlation, 1.0, 5), 0.0, 3))
     assert found is None or found.period is None
 
 
 def test_a_load_of_every_episode_is_no_swing() -> None:
     levels = pushed(lambda _, phase, __: 0.4 * (phase - np.pi), 0.0, 4)
-    found = swing(levels)
+    found = time_dependent_disturbance(levels)
     assert found is not None
     assert found.period is None
-    told = said(levels, found)
-    assert (told["period"], dependence(told)) == (None, "time")
-    assert told["description"].endswith("wanders with time: it has no single period")
+    remainder = said(levels, found)
+    assert (remainder["period"], dependence(remainder)) == (None, "time")
+    assert remainder["description"].endswith("wanders with time: it has no single period")
     assert found.rms == pytest.approx(0.4 * np.pi / 3**0.5, rel=0.5)  # four loads
 
 
 @pytest.mark.parametrize(("friction", "shaken"), [(0.0, 0.0), (0.0, 0.3), (0.4, 0.0)])
 def test_noise_and_a_named_friction_are_no_swings(friction: float, shaken: float) -> None:
-    assert swing(pushed(lambda _, __, v: -friction * v, shaken, 1)) is None
+    assert time_dependent_disturbance(pushed(lambda _, __, v: -friction * v, shaken, 1)) is None

@@ -1,4 +1,4 @@
-"""What a search shows, on a lane whose planted load is known."""
+"""What a search shows, on a hypothesis whose planted load is known."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.setup import test_windows as held_out
 from simpel_cli.discovery.search.trials import Search, Stage, Trial
-from simpel_cli.discovery.verdict.evidence import Exhibit, exhibits
+from simpel_cli.discovery.verdict.evidence import Exhibit, evidence_tables
 from simulators.effects import Expression
 
 DRAG = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": {"range": [0, 1], "unit": "1/V"}})
@@ -22,7 +22,7 @@ def shown() -> dict[str, Exhibit]:
     """Tables of a search that would have chosen the planted load, and a drag that is not there."""
     measured = recording(3, noise=0.01, load=PLANTED)
     plan = setup(model(), measured, (), [LOAD, DRAG], 2)
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=1, width=8))
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=1, width=8))
     effects = [term.effect for term in plan.augmented.terms]
     load, drag = effects.index("load"), effects.index("drag")
 
@@ -51,7 +51,7 @@ def shown() -> dict[str, Exhibit]:
     assessor = Assessor(plan, 3)
     windows = held_out(plan, measured.test, measured.outputs)
     before, after = (assessor(t.optimum.z, windows) for t in (base, both))
-    return exhibits(search, selection, assessor, measured, windows, before, after)
+    return evidence_tables(search, selection, assessor, measured, windows, before, after)
 
 
 def test_the_latent_force_is_the_planted_load(shown: dict[str, Exhibit]) -> None:

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.filter import Moving, Noise
-from simpel_cli.discovery.likelihood.fit import Fitter, Lane
+from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.setup import Setup, setup
 from simpel_cli.discovery.search.trials import Search
@@ -42,7 +42,7 @@ def recording(seed: int = 0, noise: float = 0.05, load: float = 0.0) -> Recordin
 
 def model() -> Any:
     return Declared(
-        "lane", dt=DT,
+        "hypothesis", dt=DT,
         states={"s": {"unit": "m", "range": [-3, 3]}, "v": {"unit": "m/s", "range": [-3, 3]}},
         inputs={"u": {"unit": "V", "range": [-3, 3]}},
         parameters={"a": {"unit": "1/s", "range": [0.2, 1.2]}, "b": {"unit": "m/s^2/V", "range": [0.8, 1.8]}},
@@ -203,26 +203,26 @@ def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None
 def test_a_fit_finds_the_optimum_of_the_exact_likelihood(plan: Setup) -> None:
     from scipy.optimize import minimize
 
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=len(plan.start))
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=len(plan.start))
     n_p, n_r, n_q = plan.coordinates.sizes
     free, weight = tuple(range(n_p + n_r + n_q)), np.ones(len(plan.windows.episode))
-    (ours,) = fitter([Lane(plan.start, free, weight)])
+    (ours,) = fitter([Hypothesis(plan.start, free, weight)])
 
     def loss(part: np.ndarray) -> float:
         z = plan.start.copy()
         z[list(free)] = part
-        return fitter([Lane(z, (), weight)], 1)[0].loss
+        return fitter([Hypothesis(z, (), weight)], 1)[0].loss
 
     exact = minimize(loss, ours.z[list(free)], bounds=[(0, 1)] * len(free), options={"maxiter": 50})
     assert ours.loss < exact.fun + 0.02
 
 
 def test_a_batch_has_the_losses_and_slopes_of_its_windows_one_by_one(plan: Setup) -> None:
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=6)
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=6)
     free, count = (0, 1, 2, len(plan.start) - 2), len(plan.windows.episode)
-    single = fitter([Lane(plan.start, free, np.eye(count)[w]) for w in range(count)], 1)
-    (together,) = fitter([Lane(plan.start, free, np.ones(count))], 1)
-    prior = fitter([Lane(plan.start, free, np.zeros(count))], 1)[0]
+    single = fitter([Hypothesis(plan.start, free, np.eye(count)[w]) for w in range(count)], 1)
+    (together,) = fitter([Hypothesis(plan.start, free, np.ones(count))], 1)
+    prior = fitter([Hypothesis(plan.start, free, np.zeros(count))], 1)[0]
     total = sum(o.loss - prior.loss for o in single) + prior.loss
     np.testing.assert_allclose(together.loss, total, rtol=1e-9)
     np.testing.assert_allclose(
@@ -234,7 +234,7 @@ def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() ->
     found = {}
     for load in (0.0, 0.5):
         plan = setup(model(), recording(3, load=load), (), [LOAD], 2)
-        search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=11))
+        search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=11))
         found[load] = select(search)
         if load:
             (term,) = found[load].chosen.terms
@@ -250,21 +250,21 @@ def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() ->
 
 def test_evidence_of_a_nearly_linear_model_is_the_integral(plan: Setup) -> None:
     """Two unknowns on a grid: the Laplace value against the sum."""
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=5)
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=5)
     z = plan.start.copy()
     z[0] = plan.coordinates.unit(0, A)
     free, weight = (1, 2), np.ones(len(plan.windows.episode))
-    (best,) = fitter([Lane(z, free, weight)])
+    (best,) = fitter([Hypothesis(z, free, weight)])
     assert best.converged
     sd = np.sqrt(np.diag(best.covariance))
     steps = np.linspace(-5, 5, 21)
     grid = [(best.z[1] + a * sd[0], best.z[2] + b * sd[1]) for a in steps for b in steps]
-    lanes = []
+    hypotheses = []
     for first, second in grid:
         at = best.z.copy()
         at[1], at[2] = first, second
-        lanes.append(Lane(at, (), weight))
-    losses = np.array([o.loss for o in fitter(lanes, 1)])
+        hypotheses.append(Hypothesis(at, (), weight))
+    losses = np.array([o.loss for o in fitter(hypotheses, 1)])
     cell = (steps[1] - steps[0]) ** 2 * sd[0] * sd[1]
     integral = np.log(np.sum(np.exp(-(losses - best.loss))) * cell) - best.loss
     np.testing.assert_allclose(best.log_evidence, integral, atol=0.02)

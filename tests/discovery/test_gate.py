@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_aliases import searched
 
-from simpel_cli.discovery.likelihood.fit import Lane, Optimum
+from simpel_cli.discovery.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.gate import RUNAWAY, gates, harmful
@@ -50,13 +50,13 @@ class Fits:
     def on(self, windows: Windows) -> "Fits":
         return Fits(self.noise, windows)
 
-    def __call__(self, lanes: Sequence[Lane], most: int = 0) -> list[Optimum]:
-        return [optimum(self.fitted(lane)) for lane in lanes]
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+        return [optimum(self.fitted(hypothesis)) for hypothesis in hypotheses]
 
-    def fitted(self, lane: Lane) -> np.ndarray:
-        if lane.free == self.noise:
-            return lane.z  # parameters stay
-        return np.concatenate([lane.z[:1], self.at.begin[lane.weight == 0]])
+    def fitted(self, hypothesis: Hypothesis) -> np.ndarray:
+        if hypothesis.free == self.noise:
+            return hypothesis.z  # parameters stay
+        return np.concatenate([hypothesis.z[:1], self.at.begin[hypothesis.weight == 0]])
 
 
 class Likelihoods(Assessor):

@@ -16,7 +16,7 @@ from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.interactions import BASES, carried, names_of
-from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection, cut, select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import Setup, key_of, setup
@@ -74,11 +74,11 @@ def test_unknowns_are_carried_by_name_into_a_program_with_other_terms_and_bounds
             np.testing.assert_allclose(other.coordinates.value(i, q), values[name], rtol=1e-9)
             told += 1
     assert told == 6  # a, b, the load, two sensors, one driven state
-    knobs = other.augmented.rows(extra[0])
-    np.testing.assert_array_equal(new[knobs], other.start[knobs])
+    parameters = other.augmented.rows(extra[0])
+    np.testing.assert_array_equal(new[parameters], other.start[parameters])
 
 
-def lane(drag: Callable[[float], float], shaken: float, seed: int) -> Recording:
+def hypothesis(drag: Callable[[float], float], shaken: float, seed: int) -> Recording:
     """Episodes of dv/dt = 1.3 u - 0.7 v - drag(s) v, with process noise of `shaken` m/s per root second."""
     random, fine, episodes = np.random.default_rng(seed), 40, []
     for k in range(7):
@@ -108,11 +108,11 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     ).model()  # fmt: skip
     attach = partial(setup, glider, data, (), [FRICTION], 2)
     plan = attach()
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=10))
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=10))
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
     selection, gates, _ = gated_selection(search, assessor, select(search), terminal)
     left, gates = with_interactions(
-        Levels(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal
+        NoiseProfile(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal
     )
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left
@@ -127,7 +127,7 @@ def said(data: Recording, search: Search, assessor: Assessor, left: Selection) -
 
 @pytest.mark.slow
 def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> None:
-    data = lane(lambda s: 0.3 * s, 0.0, 0)
+    data = hypothesis(lambda s: 0.3 * s, 0.0, 0)
     search, assessor, _, left = looked(data, tmp_path)
     found = said(data, search, assessor, left)
     assert found["verdict"] == "unexplained"
@@ -139,7 +139,7 @@ def test_a_friction_that_depends_on_the_position_is_noticed(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
-    data = lane(lambda s: 0.5 * s**2, 0.0, 0)
+    data = hypothesis(lambda s: 0.5 * s**2, 0.0, 0)
     search, assessor, first, left = looked(data, tmp_path)
     assert first.chosen == left.chosen
     found = said(data, search, assessor, left)
@@ -156,7 +156,7 @@ def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_process_noise_is_no_function_of_two(tmp_path: Path, seed: int) -> None:
-    search, _, first, left = looked(lane(lambda s: 0.0, 0.3, seed), tmp_path)
+    search, _, first, left = looked(hypothesis(lambda s: 0.0, 0.3, seed), tmp_path)
     assert first == left
     assert left.chosen.terms == ()
     assert left.remainder is None

@@ -52,16 +52,16 @@ def expected(true: Any, judge: Any) -> float:
 
 
 @pytest.fixture(scope="module")
-def lane() -> tuple[Setup, Any]:
-    """The lane, and its compiled forecast."""
+def hypothesis() -> tuple[Setup, Any]:
+    """The hypothesis, and its compiled forecast."""
     plan = setup(model(), recording(), (), [LOAD], 2)
     return plan, jax.jit(partial(forecast, plan.rule, rows=ROWS, dt=DT))
 
 
 @pytest.mark.parametrize("sd", [0.0, 0.15])
-def test_the_figure_is_the_divergence_of_two_gaussians(lane: tuple[Setup, Any], sd: float) -> None:
-    """Two lanes that differ in load, damping and both noises; parameters known, and load and gain known to within sd."""
-    plan, program = lane
+def test_the_figure_is_the_divergence_of_two_gaussians(hypothesis: tuple[Setup, Any], sd: float) -> None:
+    """Two hypotheses that differ in load, damping and both noises; parameters known, and load and gain known to within sd."""
+    plan, program = hypothesis
     names = [q.name for q in plan.augmented.params]
     truth = [(A, B, 0.0, np.array([0.05, 0.07]), 0.3), (0.5, 1.1, 0.4, np.array([0.06, 0.07]), 0.2)]
     points, laws = [], []
@@ -95,9 +95,9 @@ def test_the_figure_is_the_divergence_of_two_gaussians(lane: tuple[Setup, Any], 
     np.testing.assert_allclose(told.mean[0, 1].ravel(), laws[1][0][0], atol=1e-5)
 
 
-def test_louder_process_noise_is_a_way_out(lane: tuple[Setup, Any]) -> None:
+def test_louder_process_noise_is_a_way_out(hypothesis: tuple[Setup, Any]) -> None:
     """A member that may call everything noise is harder to tell from another."""
-    plan, program = lane
+    plan, program = hypothesis
     p = np.tile(plan.augmented.neutral, (2, 5, 1))
     p[1, :, [q.name for q in plan.augmented.params].index("load_v_c")] = 1.0
     q = jnp.asarray([[[0.0, 0.01], [0.0, 1.0]]] * 2)
@@ -161,7 +161,7 @@ def swings(tau: float = 0.35, rows: int = 30) -> Recording:
 def tied() -> tuple[Search, Selection]:
     """Both frictions fitted, and called a tie."""
     plan = setup(pendulum(), swings(), (), [COULOMB, VISCOUS], 2)
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, lanes=4, width=8))
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=4, width=8))
     base = search.base()
     effects = [t.effect for t in search.terms]
     trials = search.add(base, [effects.index("coulomb_friction"), effects.index("viscous_friction")]).trials

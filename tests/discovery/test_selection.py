@@ -12,7 +12,7 @@ from test_aliases import searched
 from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
-from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.discovery.measurements.cleaning import Cleaned
 from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
@@ -34,14 +34,18 @@ class MadeUp:
     def __init__(self, row: int, neutral: float) -> None:
         self.row, self.neutral, self.far = row, neutral, 0
 
-    def __call__(self, lanes: Sequence[Lane], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
         found = []
-        for lane in lanes:
-            far = abs(lane.z[self.row] - self.neutral) > 0.02
+        for hypothesis in hypotheses:
+            far = abs(hypothesis.z[self.row] - self.neutral) > 0.02
             self.far += far and most == 0
-            eye, d = np.eye(len(lane.free)), len(lane.free)
+            eye, d = np.eye(len(hypothesis.free)), len(hypothesis.free)
             loss = 500.0 if far else 80.0
-            found.append(Optimum(lane.z, lane.free, loss, -loss, np.ones(d), 1e3 * eye, np.full(d, 0.5), eye, 1, True))
+            found.append(
+                Optimum(
+                    hypothesis.z, hypothesis.free, loss, -loss, np.ones(d), 1e3 * eye, np.full(d, 0.5), eye, 1, True
+                )
+            )
         return found
 
 
@@ -64,8 +68,11 @@ def test_a_candidate_starts_with_noise_that_a_wrong_size_can_hide_in() -> None:
     n_p, n_r, n_q = search.plan.coordinates.sizes
     z = search.plan.start.copy()
     z[n_p : n_p + n_r + n_q] = 0.0  # a filter that is sure of everything
-    for lane in (*search.lanes((0,), 0, z), search.beside(Trial((), search.base().optimum._replace(z=z)), 0)):
-        r, q = lane.z[n_p : n_p + n_r], lane.z[n_p + n_r : n_p + n_r + n_q]
+    for hypothesis in (
+        *search.hypotheses((0,), 0, z),
+        search.beside(Trial((), search.base().optimum._replace(z=z)), 0),
+    ):
+        r, q = hypothesis.z[n_p : n_p + n_r], hypothesis.z[n_p + n_r : n_p + n_r + n_q]
         np.testing.assert_array_equal(r, search.plan.start[n_p : n_p + n_r])
         assert (q >= search.plan.start[n_p + n_r : n_p + n_r + n_q] - QUIETER).all()
     loud = z.copy()
@@ -103,14 +110,16 @@ class Table:
             return self.evidence[names]
         return max(self.of(names - {name}) for name in names) - 1
 
-    def __call__(self, lanes: Sequence[Lane], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
         found = []
-        for lane in lanes:
-            on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(lane.free)}
+        for hypothesis in hypotheses:
+            on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(hypothesis.free)}
             value = float(self.of(frozenset(self.name(i) for i in on)))
-            d, eye = len(lane.free), np.eye(len(lane.free))
+            d, eye = len(hypothesis.free), np.eye(len(hypothesis.free))
             slope = np.full(d, 100.0)  # everything promises the same, and enough to be fitted
-            found.append(Optimum(lane.z, lane.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True))
+            found.append(
+                Optimum(hypothesis.z, hypothesis.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True)
+            )
         return found
 
     def chosen(self, **options: int) -> str:
@@ -148,7 +157,7 @@ def test_a_function_that_promises_much_keeps_no_name_from_being_fitted(monkeypat
     table = Table({"": 0.0})
     table.search.banned = set(sorted(table.search.banned)[2:])
 
-    def promised(_: Any, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+    def promised(_: Any, starts: Sequence[tuple[int, Hypothesis]]) -> list[Score]:
         size = {"?": 250.0, "A": 20.0, "E": 1.6}
         return [Score(size.get(table.name(t), 19.0), 1.0) for t, _ in starts]
 
@@ -220,8 +229,8 @@ def test_names_are_tied_by_evidence_or_by_fits_that_differ_in_the_width_of_prior
 
 
 def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> None:
-    knob = {"range": ["0", "8*dt"], "unit": "s", "starts": ["0.5*dt", "5*dt"]}
-    late = Expression("late", acts_on="input", operator="delay", parameters={"d": knob})
+    parameter = {"range": ["0", "8*dt"], "unit": "s", "starts": ["0.5*dt", "5*dt"]}
+    late = Expression("late", acts_on="input", operator="delay", parameters={"d": parameter})
     search: Any = searched("b", [late])
     search.fitter = MadeUp(search.rows[0][0], 0.0)
     before = Trial((), search.base().optimum)

@@ -99,12 +99,12 @@ def terms_of(name: str) -> list[tuple[Model, Term]]:
 
 
 def values(
-    model: Model, term: Term, x: list[float], u: list[float], knobs: list[float]
+    model: Model, term: Term, x: list[float], u: list[float], parameters: list[float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rates and readings with one term, parameters in the middle of their ranges."""
     together = augment(model, [term], [q.name for q in model.states])
-    begin = len(model.params)  # behind the knobs: constants
-    p = np.concatenate([together.neutral[:begin], knobs, together.neutral[begin + len(knobs) :]])
+    begin = len(model.params)  # behind the parameters: constants
+    p = np.concatenate([together.neutral[:begin], parameters, together.neutral[begin + len(parameters) :]])
     rates, y = together.function(casadi.DM(x), casadi.DM(u), casadi.DM(p))
     return np.asarray(rates).ravel(), np.asarray(y).ravel()
 
@@ -138,7 +138,7 @@ class TestEffect:
         for model, term in terms_of(name):
             for x, u in points(model):
                 old = np.asarray(model.function()(x, u, augment(model, [], MEASURED[model.name]).neutral)[0])
-                rates, y = values(model, term, x, u, [k.neutral for k in term.knobs])
+                rates, y = values(model, term, x, u, [k.neutral for k in term.parameters])
                 np.testing.assert_allclose(rates, old.ravel(), rtol=1e-12, atol=1e-12)
                 np.testing.assert_allclose(y, x, rtol=1e-12)
 
@@ -146,24 +146,24 @@ class TestEffect:
         for model, term in terms_of(name):
             if term.kind in OPERATORS:
                 continue
-            starts = [k.starts[0] for k in term.knobs]
+            starts = [k.starts[0] for k in term.parameters]
             change = 0.0
             for x, u in [*points(model), ([q.high for q in model.states], [q.high for q in model.inputs])]:
-                old = values(model, term, x, u, [k.neutral for k in term.knobs])
+                old = values(model, term, x, u, [k.neutral for k in term.parameters])
                 new = values(model, term, x, u, starts)
                 change = max(change, *(np.abs(a - b).max() for a, b in zip(old, new, strict=True)))
             assert change > 0
 
     def test_starts_and_neutral_point_lie_in_the_range(self, name: str) -> None:
         for _, term in terms_of(name):
-            for knob in term.knobs:
-                assert knob.low < knob.high
-                assert all(knob.low < s < knob.high for s in knob.starts)
+            for parameter in term.parameters:
+                assert parameter.low < parameter.high
+                assert all(parameter.low < s < parameter.high for s in parameter.starts)
                 # a limit is neutral where nothing reaches it, beyond the range
-                assert knob.low <= knob.neutral <= knob.high or (
-                    term.effect in ("input_saturation", "traction_limit") and knob.neutral > knob.high
+                assert parameter.low <= parameter.neutral <= parameter.high or (
+                    term.effect in ("input_saturation", "traction_limit") and parameter.neutral > parameter.high
                 )
-                assert re.fullmatch(r"[\w^/() ]+", knob.unit), knob.unit
+                assert re.fullmatch(r"[\w^/() ]+", parameter.unit), parameter.unit
 
     def test_never_adds_energy_if_it_says_so(self, name: str) -> None:
         effect, random = catalogue(name), np.random.default_rng(1)
@@ -172,19 +172,19 @@ class TestEffect:
         for model, term in terms_of(name):
             rows = [i for i, q in enumerate(model.states) if q.name in term.rates]
             for x, u in points(model):
-                knobs = [float(random.uniform(k.low, k.high)) for k in term.knobs]
-                off = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
-                assert (values(model, term, x, u, knobs)[0] - off)[rows] @ np.array(x)[rows] <= 0
+                parameters = [float(random.uniform(k.low, k.high)) for k in term.parameters]
+                off = values(model, term, x, u, [k.neutral for k in term.parameters])[0]
+                assert (values(model, term, x, u, parameters)[0] - off)[rows] @ np.array(x)[rows] <= 0
 
 
 @pytest.mark.parametrize("name", ["viscous_friction", "coulomb_friction", "stribeck_friction", "quadratic_drag"])
 def test_friction_is_odd_in_speed(name: str) -> None:
     for model, term in terms_of(name):
-        knobs = [k.starts[0] for k in term.knobs]
+        parameters = [k.starts[0] for k in term.parameters]
         for speed in (0.01, 0.5, 3.0):
             pushes = [
-                values(model, term, [0.3, s], [0.0], knobs)[0][1]
-                - values(model, term, [0.3, s], [0.0], [k.neutral for k in term.knobs])[0][1]
+                values(model, term, [0.3, s], [0.0], parameters)[0][1]
+                - values(model, term, [0.3, s], [0.0], [k.neutral for k in term.parameters])[0][1]
                 for s in (speed, -speed)
             ]
             assert pushes[0] < 0
@@ -196,9 +196,9 @@ def term_on(name: str, model: Model) -> Term:
     return term
 
 
-def push(model: Model, term: Term, x: list[float], u: list[float], knobs: list[float]) -> np.ndarray:
-    off = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
-    return values(model, term, x, u, knobs)[0] - off
+def push(model: Model, term: Term, x: list[float], u: list[float], parameters: list[float]) -> np.ndarray:
+    off = values(model, term, x, u, [k.neutral for k in term.parameters])[0]
+    return values(model, term, x, u, parameters)[0] - off
 
 
 def along(model: Model, theta: float, long: float, lat: float) -> tuple[list[float], np.ndarray]:
@@ -239,7 +239,7 @@ class TestCarWithTwoVelocities:
         term, limit = term_on("traction_limit", model), 1.2
         v, turn = along(model, theta, 1.5, 0.4)
         x, u, yaw = [0.1, 0.2, theta, *v, 0.3], [0.5, 0.9], 0.3
-        own = values(model, term, x, u, [k.neutral for k in term.knobs])[0]
+        own = values(model, term, x, u, [k.neutral for k in term.parameters])[0]
         # d(long)/dt by a difference: a short time along the model's own rates
         after = np.array(x) + 1e-7 * own
         long = after[3] if model is BODY else after[3] * np.cos(after[2]) + after[4] * np.sin(after[2])
@@ -291,7 +291,7 @@ def test_a_term_per_part_is_for_vehicles() -> None:
 
 
 def test_units_follow_from_the_model() -> None:
-    units = {t.effect: t.knobs[0].unit for m, t in (pair for n in NAMES for pair in terms_of(n)) if m is PENDULUM}
+    units = {t.effect: t.parameters[0].unit for m, t in (pair for n in NAMES for pair in terms_of(n)) if m is PENDULUM}
     assert units["viscous_friction"] == "1/s"
     assert units["coulomb_friction"] == "rad/s^2"
     assert units["quadratic_drag"] == "1/rad"
@@ -299,8 +299,8 @@ def test_units_follow_from_the_model() -> None:
     assert units["input_delay"] == "s"
     assert units["input_dead_zone"] == "V"
     assert units["input_backlash"] == "V"
-    assert [k.unit for k in term_on("tyre_slip", WORLD).knobs] == ["s/m^2", "s/(m rad)"]
-    assert [k.unit for k in term_on("tyre_slip", SINGLE).knobs] == ["s^2/m^2"]
+    assert [k.unit for k in term_on("tyre_slip", WORLD).parameters] == ["s/m^2", "s/(m rad)"]
+    assert [k.unit for k in term_on("tyre_slip", SINGLE).parameters] == ["s^2/m^2"]
 
 
 def test_roles_are_read_off_the_model() -> None:
@@ -332,23 +332,23 @@ def test_unnamed_functions_reach_every_argument() -> None:
         1
     }  # too many arguments
     assert {t.acts_on for t in found} == {"omega"}
-    assert all(k.prior == "normal" for t in found for k in t.knobs)
+    assert all(k.prior == "normal" for t in found for k in t.parameters)
 
 
 def test_a_function_of_a_pair_has_the_product_of_the_priors() -> None:
     scales = SCALES["tanks"]
     found = {t.depends_on: t for t in unnamed(TANKS, scales, pairs=True) if t.acts_on == "h"}
     pair, first, second = (found[a] for a in (("h", "u"), ("h",), ("u",)))
-    sd = lambda term, label: next(k.high / 2 for k in term.knobs if k.label == label)  # noqa: E731
+    sd = lambda term, label: next(k.high / 2 for k in term.parameters if k.label == label)  # noqa: E731
     amplitude = 0.3 * scales.rate["h"]
     for j, k in ((1, 1), (2, 3), (3, 2)):
         product = sd(first, f"w{j}") * sd(second, f"w{k}") / amplitude
         np.testing.assert_allclose(sd(pair, f"w{j}{k}"), product, rtol=1e-12)
     # one weight alone is the product of its two waves
     x, u = [0.3, 0.5], [0.7]
-    one = [float(k.label == "w23") for k in pair.knobs]
+    one = [float(k.label == "w23") for k in pair.parameters]
     waves = [
-        push(TANKS, term, x, u, [float(k.label == label) for k in term.knobs])[0]
+        push(TANKS, term, x, u, [float(k.label == label) for k in term.parameters])[0]
         for term, label in ((first, "w2"), (second, "w3"))
     ]
     assert abs(waves[0] * waves[1]) > 0.01

@@ -286,17 +286,21 @@ class SAC:
 
             def update(carry: tuple[Weights, Array, Any], given: tuple[Transitions, Array]) -> tuple[Any, Any]:
                 weights, targets, inner = carry
-                slope, told = jax.grad(loss, has_aux=True)(weights, targets, *given)
+                slope, reported = jax.grad(loss, has_aux=True)(weights, targets, *given)
                 with jax.numpy_dtype_promotion("standard"):  # optax mixes float and int32 in its bias correction
                     change, inner = optimiser.update(slope, inner, weights)
                 weights = optax.apply_updates(weights, change)
                 targets = targets + self.polyak * (weights.critics - targets)
-                return (weights, targets, inner), told
+                return (weights, targets, inner), reported
 
-            carry, told = jax.lax.scan(update, (state.weights, state.targets, state.optimiser), (found, noise))
+            carry, reported = jax.lax.scan(update, (state.weights, state.targets, state.optimiser), (found, noise))
             weights, targets, inner = carry
             info = Info(
-                jnp.mean(rows.reward), jnp.mean(told[0]), jnp.mean(told[1]), jnp.exp(weights.log_temperature), broken
+                jnp.mean(rows.reward),
+                jnp.mean(reported[0]),
+                jnp.mean(reported[1]),
+                jnp.exp(weights.log_temperature),
+                broken,
             )
             return State(weights, targets, inner, replay, scaler, situation, age, seen), info
 

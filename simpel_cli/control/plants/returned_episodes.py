@@ -82,14 +82,14 @@ class ReturnedEpisodes:
             return
         beyond = np.maximum(quantity.low - values, values - quantity.high) / (quantity.high - quantity.low)
         row = int(np.argmax(beyond))
-        told = (
+        problem = (
             f"{path.name}, row {row}: {quantity.name} is {values[row]:.4g} {quantity.unit}, far outside its range "
             f"[{quantity.low:g}, {quantity.high:g}] (sim.states.{quantity.name})"
         )
         if beyond[row] > FAR:
-            raise DataError(f"{told}. Take the spike out, or declare the range that the rig has.")
+            raise DataError(f"{problem}. Take the spike out, or declare the range that the rig has.")
         if beyond[row] > ODD:
-            self.say(f"{told}: a spike of the sensor would spoil the model")
+            self.say(f"{problem}: a spike of the sensor would spoil the model")
 
     def remark(self, path: Path, episode: PlantEpisode, policy: Path) -> None:
         """Say what is odd about an episode."""

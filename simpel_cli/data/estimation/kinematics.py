@@ -101,12 +101,12 @@ def differences(motions: Sequence[Motion]) -> dict[str, str]:
 def derived(motions: Sequence[Motion], declared: Sequence[str] = ()) -> Check:
     """Report velocities that are a difference quotient of the position; those that were declared are no news."""
     found = {name: kind for name, kind in differences(motions).items() if name not in declared}
-    told = f"{', '.join(declared)}: declared as computed from other columns" if declared else ""
+    note = f"{', '.join(declared)}: declared as computed from other columns" if declared else ""
     if not found:
-        return Check("derived", True, told or "no velocity is a difference of its position")
+        return Check("derived", True, note or "no velocity is a difference of its position")
     equal = "; ".join(f"{name} is {kind}" for name, kind in found.items())
     nulls = ", ".join(f"{name}: null" for name in found)
-    also = f"; {told}" if told else ""
+    also = f"; {note}" if note else ""
     return Check("derived", False, f"{equal}, not a measurement of its own: set data.columns {{{nulls}}}{also}")
 
 
@@ -144,7 +144,7 @@ def _fit(time: np.ndarray, change: np.ndarray, integral: np.ndarray, variance: f
     design = np.stack([integral, time], axis=1)
     size = np.sqrt((design**2).sum(axis=0))
     gram = (design / size).T @ (design / size)
-    if np.linalg.eigvalsh(gram)[0] < 1e-3:  # a constant speed: what is offset and what is scale cannot be told
+    if np.linalg.eigvalsh(gram)[0] < 1e-3:  # a constant speed: what is offset and what is scale cannot be known
         design, size, gram = design[:, :1], size[:1], np.ones((1, 1))
     coefficients = np.linalg.solve(gram, (design / size).T @ change)
     residual = change - (design / size) @ coefficients

@@ -23,7 +23,8 @@ class Augmented(NamedTuple):
         model: the simulator as it was.
         terms: candidates.
         measured: names of the measured states and outputs, the rows of a measurement.
-        function: CasADi function (x, u, p) -> (d(x)/dt, measured); p is the model's parameters, all knobs, all constants.
+        function: CasADi function (x, u, p) -> (d(x)/dt, measured); p: parameters of the model, then of all effects,
+            then all constants.
         params: the rows of p; those of constants have one value for range.
         neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
         operators: kind -> (index of the signal, row of p) for delays, lags and plays, of the model and of the terms.
@@ -46,7 +47,7 @@ class Augmented(NamedTuple):
     def rows(self, term: Term) -> list[int]:
         """Rows of p that belong to a term."""
         names = [q.name for q in self.params]
-        return [names.index(k.name) for k in term.knobs]
+        return [names.index(k.name) for k in term.parameters]
 
 
 def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Augmented:
@@ -54,9 +55,11 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
     params = [*model.params]
     neutral = [centre(q) for q in model.params]
     for term in terms:
-        for knob in term.knobs:
-            params.append(Quantity(knob.name, knob.unit, knob.low, knob.high, prior=knob.prior))
-            neutral.append(knob.neutral)
+        for parameter in term.parameters:
+            params.append(
+                Quantity(parameter.name, parameter.unit, parameter.low, parameter.high, prior=parameter.prior)
+            )
+            neutral.append(parameter.neutral)
     for name, value in dict(c for term in terms for c in term.constants).items():
         params.append(Quantity(name, "1", value, value))
         neutral.append(value)
@@ -104,7 +107,7 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
     for kind in OPERATORS:
         signals = [q.name for q in model.inputs] if kind in ON_INPUT else [*measured]
         operators[kind] = tuple(
-            (signals.index(t.acts_on), columns.index(t.knobs[0].name)) for t in terms if t.kind == kind
+            (signals.index(t.acts_on), columns.index(t.parameters[0].name)) for t in terms if t.kind == kind
         )
     constant: dict[str, tuple[float, ...]] = {}
     for kind, times in ((DELAY, model.delay), (LAG, model.lag)):

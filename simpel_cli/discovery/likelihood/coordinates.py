@@ -1,7 +1,7 @@
 """The unknowns of a fit, each mapped onto the unit interval between its bounds.
 
-theta = (parameters and knobs p, log r, log q). In these coordinates a uniform prior has density 1, bounds are 0 and 1,
-and every unknown has the same scale, so that damping and floors need no units.
+theta = (parameters p of model and effects, log r, log q). In these coordinates a uniform prior has density 1, bounds are 0
+and 1, and every unknown has the same scale, so that damping and floors need no units.
 """
 
 from typing import Any, NamedTuple

@@ -34,7 +34,7 @@ ROUND = 4  # iterations after which fits that have arrived make room for others
 FIRST_DAMPING = 1e-2
 
 
-class Lane(NamedTuple):
+class Hypothesis(NamedTuple):
     """One hypothesis: where to start, which unknowns move, and how much each window counts."""
 
     z: np.ndarray  # (n,) start of all unknowns
@@ -72,10 +72,10 @@ class Optimum(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Where the fits of a batch of lanes stand; NumPy outside the program, JAX inside; leading axis: lanes."""
+    """Where the fits of a batch of hypotheses stand; NumPy outside the program, JAX inside; leading axis: hypotheses."""
 
     z: Any  # (L, n) where they started
-    index: Any  # (L, width) of z that move: every level of noise, in order, then parameters and knobs
+    index: Any  # (L, width) of z that move: every level of noise, in order, then parameters of model and effects
     moves: Any  # (L, width) False: padding
     weight: Any  # (L, W)
     trial: Any  # (L, width) the next point to try
@@ -90,36 +90,36 @@ class Course(NamedTuple):
 
 
 class Fitter:
-    """Fits hypotheses; one compiled program for a batch of `lanes`, with up to `width` free unknowns each.
+    """Fits hypotheses; one compiled program for a batch of `side_by_side`, with up to `width` free unknowns each.
 
     Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
     those that wait, always in the same order: a result does not depend on the number of threads.
     """
 
     def __init__(
-        self, rule: Filter, coordinates: Coordinates, windows: Windows, *, lanes: int = 4, width: int = 16
+        self, rule: Filter, coordinates: Coordinates, windows: Windows, *, side_by_side: int = 4, width: int = 16
     ) -> None:
-        self.coordinates, self.windows, self.lanes, self.width = coordinates, windows, lanes, width
+        self.coordinates, self.windows, self.side_by_side, self.width = coordinates, windows, side_by_side, width
         self._data = tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
         self._program = _program(rule, coordinates.layout)
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
         self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
-    def __call__(self, hypotheses: Sequence[Lane], most: int = MOST) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST) -> list[Optimum]:
         """Fit every hypothesis with `most` iterations."""
         if not hypotheses:
             return []
         state = self._begin(hypotheses)
         waiting = np.arange(len(hypotheses))
         while waiting.size:
-            chunks = [waiting[i : i + self.lanes] for i in range(0, len(waiting), self.lanes)]
+            chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
             # the first call compiles: not twice side by side
             threads = self._threads.map if self._program._cache_size() else map
             for chunk, ended in zip(chunks, threads(partial(self._advanced, state, most), chunks), strict=True):
                 for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
             waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
-        return [self._optimum(state, i, lane.free) for i, lane in enumerate(hypotheses)]
+        return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]
 
     def on(self, windows: Windows) -> "Fitter":
         """Return the same fitter for windows of the same shape; it shares the compiled program."""
@@ -127,23 +127,25 @@ class Fitter:
         other.windows, other._data = windows, tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
         return other
 
-    def _begin(self, lanes: Sequence[Lane]) -> Course:
+    def _begin(self, hypotheses: Sequence[Hypothesis]) -> Course:
         padding = len(self.coordinates.low) - 1
         noise = self._noise
-        index = np.full((len(lanes), self.width), padding)
+        index = np.full((len(hypotheses), self.width), padding)
         index[:, : len(noise)] = noise
         moves = np.zeros(index.shape, bool)
-        for i, lane in enumerate(lanes):
-            columns = self._columns(lane.free)
+        for i, hypothesis in enumerate(hypotheses):
+            columns = self._columns(hypothesis.free)
             if max(columns, default=0) >= self.width:
-                raise ValueError(f"{len(lane.free)} free unknowns, room for {self.width - len(noise)} beside the noise")
-            index[i, columns] = lane.free
+                raise ValueError(
+                    f"{len(hypothesis.free)} free unknowns, room for {self.width - len(noise)} beside the noise"
+                )
+            index[i, columns] = hypothesis.free
             moves[i, columns] = True
-        z = np.stack([lane.z for lane in lanes])
+        z = np.stack([hypothesis.z for hypothesis in hypotheses])
         part = np.take_along_axis(z, index, axis=1)
         count, width = index.shape
         return Course(
-            z, index, moves, np.stack([lane.weight for lane in lanes]), part.copy(), part,
+            z, index, moves, np.stack([hypothesis.weight for hypothesis in hypotheses]), part.copy(), part,
             np.full(count, np.inf), np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1)),
             np.full(count, FIRST_DAMPING), np.zeros(count, int), np.zeros(count, bool), np.zeros(count, int),
         )  # fmt: skip
@@ -160,10 +162,10 @@ class Fitter:
         return [i - noise.start if i in noise else next(others) for i in free]
 
     def _advanced(self, state: Course, most: int, chunk: np.ndarray) -> list[np.ndarray]:
-        filled = np.concatenate([chunk, np.repeat(chunk[:1], self.lanes - len(chunk))])
-        lanes = Course(*(jnp.asarray(a[filled]) for a in state))
+        filled = np.concatenate([chunk, np.repeat(chunk[:1], self.side_by_side - len(chunk))])
+        course = Course(*(jnp.asarray(a[filled]) for a in state))
         with jax.enable_x64(True):
-            ended = self._program(self._bounds, jnp.asarray(min(most, ROUND)), lanes, self._data)
+            ended = self._program(self._bounds, jnp.asarray(min(most, ROUND)), course, self._data)
         return [np.asarray(a) for a in ended]
 
     def _optimum(self, state: Course, i: int, free: tuple[int, ...]) -> Optimum:
@@ -209,11 +211,11 @@ def _program(rule: Filter, layout: tuple[Any, ...]) -> Any:
 
 
 def _advance(
-    rule: Filter, layout: tuple[Any, ...], bounds: tuple[Array, ...], most: Array, lanes: Course, data: Any
+    rule: Filter, layout: tuple[Any, ...], bounds: tuple[Array, ...], most: Array, course: Course, data: Any
 ) -> Course:
-    """Levenberg-Marquardt on Fisher information, inside the unit box: `most` iterations of every lane."""
+    """Levenberg-Marquardt on Fisher information, inside the unit box: `most` iterations of every hypothesis."""
     coordinates = Coordinates.of(bounds, layout)
-    evaluate = partial(_evaluate, rule, coordinates, lanes, data)
+    evaluate = partial(_evaluate, rule, coordinates, course, data)
 
     def body(carry: tuple[Course, Array]) -> tuple[Course, Array]:
         now, count = carry
@@ -223,19 +225,19 @@ def _advance(
     def going(carry: tuple[Course, Array]) -> Array:
         return (carry[1] < most) & ~jnp.all(carry[0].done)
 
-    return jax.lax.while_loop(going, body, (lanes, jnp.asarray(0)))[0]
+    return jax.lax.while_loop(going, body, (course, jnp.asarray(0)))[0]
 
 
 def _evaluate(
-    rule: Filter, coordinates: Coordinates, lanes: Course, data: Any, part: Array
+    rule: Filter, coordinates: Coordinates, course: Course, data: Any, part: Array
 ) -> tuple[Array, Array, Array]:
     """Negative log posterior (L,), its gradient (L, width) and Fisher information (L, width, width)."""
     count = part.shape[0]
     y, ok, u, start, spread = data
     windows = start.shape[-1]
-    # lanes times windows are the points of the filter, all windows of a lane side by side
+    # hypotheses times windows are the points of the filter, all windows of a hypothesis side by side
     tiled = [jnp.tile(a, (1,) * (a.ndim - 1) + (count,)) for a in (y, ok, u, start, spread)]
-    z = jax.vmap(lambda z, i, v, m: z.at[i].set(jnp.where(m, v, z[i])))(lanes.z, lanes.index, part, lanes.moves)
+    z = jax.vmap(lambda z, i, v, m: z.at[i].set(jnp.where(m, v, z[i])))(course.z, course.index, part, course.moves)
 
     each = partial(jnp.repeat, repeats=windows, axis=-1)
     physical = jax.vmap(coordinates.physical, out_axes=-1)
@@ -260,13 +262,13 @@ def _evaluate(
         return jax.jvp(louder, (z,), (jnp.broadcast_to(direction, z.shape),))[1]
 
     levels = jnp.zeros((n_r + n_q, z.shape[1])).at[jnp.arange(n_r + n_q), n_p + jnp.arange(n_r + n_q)].set(1.0)
-    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one, in_axes=1)(lanes.index[:, n_r + n_q :])
+    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one, in_axes=1)(course.index[:, n_r + n_q :])
     de, ds = (jnp.concatenate(pair) for pair in zip(noises, others, strict=True))
     ok = ok > 0
     s = jnp.where(ok, track.variance, 1.0)
     e = jnp.where(ok, track.innovation, 0.0)
     de, ds = (jnp.where(ok[None], a, 0.0) for a in (de, ds))
-    weight = lanes.weight.reshape(-1)
+    weight = course.weight.reshape(-1)
 
     def per_lane(a: Array) -> Array:
         """(..., T, ny, L W) -> (L, ..., T ny W)."""
@@ -283,21 +285,21 @@ def _evaluate(
     scaled = jnp.concatenate([slopes * root, spreads * root * per_lane(jnp.sqrt(0.5 / s))[:, None]], axis=2)
     fisher = jnp.einsum("ldk,lek->lde", scaled, scaled)
 
-    sd = coordinates.sd_of_prior()[lanes.index]
-    normal = jnp.isfinite(sd) & lanes.moves
+    sd = coordinates.sd_of_prior()[course.index]
+    normal = jnp.isfinite(sd) & course.moves
     inverse_variance = jnp.where(normal, 1 / sd**2, 0.0)
     log_norm = jnp.sum(jnp.where(normal, jnp.log(jnp.where(normal, sd, 1.0)) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
     away = part - 0.5
     loss = loss + 0.5 * jnp.sum(inverse_variance * away**2, axis=1) + log_norm
-    gradient = jnp.where(lanes.moves, gradient + inverse_variance * away, 0.0)
-    both_move = lanes.moves[:, :, None] & lanes.moves[:, None, :]
+    gradient = jnp.where(course.moves, gradient + inverse_variance * away, 0.0)
+    both_move = course.moves[:, :, None] & course.moves[:, None, :]
     fisher = jnp.where(both_move, fisher, 0.0) + jax.vmap(jnp.diag)(inverse_variance)
     finite = jnp.isfinite(loss) & jnp.isfinite(gradient).all(axis=1) & jnp.isfinite(fisher).all(axis=(1, 2))
     return jnp.where(finite, loss, jnp.inf), gradient, fisher
 
 
 def _stepped(now: Course, new_loss: Array, new_gradient: Array, new_fisher: Array) -> Course:
-    """One lane after its trial was evaluated: taken or not, and the next trial."""
+    """One hypothesis after its trial was evaluated: taken or not, and the next trial."""
     better = new_loss < now.loss
     keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
     part, loss = keep(now.trial, now.part), keep(new_loss, now.loss)

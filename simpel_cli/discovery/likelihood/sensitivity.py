@@ -38,11 +38,11 @@ def shifts(track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarra
         cov = np.array(track.predicted_cov[:, k])
         for j in range(ok.shape[2]):
             h = track.slope[:, k, j]
-            told = ok[:, k, j, None] > 0
-            change = np.where(told, -np.einsum("wi,win->wn", h, d), 0.0)
+            measured = ok[:, k, j, None] > 0
+            change = np.where(measured, -np.einsum("wi,win->wn", h, d), 0.0)
             found[:, k, j] = change
             gain = np.einsum("wij,wj->wi", cov, h)
-            pull = np.where(told, gain / track.variance[:, k, j, None], 0.0)
+            pull = np.where(measured, gain / track.variance[:, k, j, None], 0.0)
             d = d + pull[:, :, None] * change[:, None]
             cov = cov - pull[:, :, None] * gain[:, None]
         f = track.jacobian[:, k]
@@ -58,7 +58,7 @@ def waves(
 
     Args:
         augmented: a model that has the term.
-        term: a function without a name: linear in its knobs, which have normal priors.
+        term: a function without a name: linear in its parameters, which have normal priors.
         p: (dp,) values of all parameters.
         points: states (..., nx) and inputs (..., nu).
     """
@@ -67,7 +67,7 @@ def waves(
     row = [s.name for s in augmented.model.states].index(term.acts_on)
     slope = casadi.jacobian(function(x, u, q)[0][row], q)[:, augmented.rows(term)]
     program = casadi.Function("waves", [x, u, q], [casadi.densify(slope).T])
-    sd = np.array([(knob.high - knob.low) / 4 for knob in term.knobs])
+    sd = np.array([(parameter.high - parameter.low) / 4 for parameter in term.parameters])
     found = []
     for states, inputs in points:
         # a model may have no input

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from simpel_cli.discovery.likelihood.fit import Lane
+from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.next_experiment.candidates import (
     Proposal,
     neighbours,
@@ -30,7 +30,7 @@ from simpel_cli.discovery.next_experiment.candidates import (
 from simpel_cli.discovery.next_experiment.discrimination import Forecast, Members, forecast
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
-from simpel_cli.discovery.verdict.aliases import twins
+from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.runs.files import write_text
 
 FILE = "next_experiment.csv"
@@ -45,7 +45,7 @@ Pair = tuple[int, int]
 
 
 class Class(NamedTuple):
-    """Fits that do equally well, and which of them are to be told apart."""
+    """Fits that do equally well, and which of them are to be distinguished."""
 
     trials: tuple[Trial, ...]
     names: tuple[str, ...]
@@ -116,7 +116,7 @@ def class_of(search: Search, selection: Selection) -> Class:
             if i != j
             and terms[first].effect not in terms[second].same_as
             and terms[second].effect not in terms[first].same_as
-            and not twins(search, selection.chosen, (first, trials[i]), (second, trials[j]))
+            and not are_aliases(search, selection.chosen, (first, trials[i]), (second, trials[j]))
         ]
         if own:
             names.append(terms[chosen].effect)
@@ -166,8 +166,8 @@ class Designer:
         start = np.stack([episodes[i].start for i in padded])
         spread = self.plan.windows.spread[0]
         given = (u, start, spread, np.zeros_like(spread), self.wraps)
-        told: Forecast = self._program(self.members, *(jnp.asarray(a) for a in given))
-        ratio, distance, mean, states, finite = (np.asarray(a) for a in told)
+        forecast: Forecast = self._program(self.members, *(jnp.asarray(a) for a in given))
+        ratio, distance, mean, states, finite = (np.asarray(a) for a in forecast)
         fine = finite & self._inside(states)
         ratio = np.minimum(ratio, distance)  # what the noise alone would tell is not relied on
         pairs = tuple(np.array(self.tied.pairs).T)
@@ -197,7 +197,7 @@ def members_of(search: Search, trials: Sequence[Trial]) -> Members:
     louder = np.zeros((len(LOUDER), len(coordinates.low)))
     louder[:, q_rows] = np.log(LOUDER)[:, None] / (coordinates.high - coordinates.low)[q_rows]
     most = max(sum(row < n_p for row in t.optimum.free) for t in trials)
-    points, levels, lanes = [], [], []
+    points, levels, hypotheses = [], [], []
     for trial in trials:
         z, free = trial.optimum.z, np.array(trial.optimum.free)
         own = np.flatnonzero(free < n_p)
@@ -207,10 +207,10 @@ def members_of(search: Search, trials: Sequence[Trial]) -> Members:
         # a secant over one standard deviation to each side, inside the bounds: the posterior ends there
         points.append(np.clip(np.concatenate([z[None], z + directions, z - directions]), 0.0, 1.0))
         levels.append(np.clip(z + louder, 0.0, 1.0))
-        lanes += [Lane(level, trial.optimum.free, search.ones) for level in levels[-1]]
+        hypotheses += [Hypothesis(level, trial.optimum.free, search.ones) for level in levels[-1]]
     p = jax.vmap(jax.vmap(lambda z: coordinates.physical(z)[0]))(jnp.asarray(np.stack(points)))
     noise = jax.vmap(jax.vmap(lambda z: coordinates.physical(z)[1]))(jnp.asarray(np.stack(levels)))
-    losses = np.array([o.loss for o in search.fitter(lanes, 1)]).reshape(len(trials), -1)
+    losses = np.array([o.loss for o in search.fitter(hypotheses, 1)]).reshape(len(trials), -1)
     weight = losses.min(axis=1, keepdims=True) - losses
     weight = weight - np.log(np.exp(weight).sum(axis=1, keepdims=True))
     return Members(p, noise.r[:, 0], noise.q, jnp.asarray(weight))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.gate import Gate, gates
 from simpel_cli.discovery.search.interactions import interaction
-from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import Setup
@@ -49,7 +49,7 @@ def gated_selection(
         failed = [i for i, found in enumerate(judged) if not found.passed]
         gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
         for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
-            _told(search.terms[term].label, found, terminal, out=i == gone)
+            _report_gate(search.terms[term].label, found, terminal, out=i == gone)
         if gone is None:
             return selection, judged, harmful
         if judged[gone].harm:
@@ -60,7 +60,7 @@ def gated_selection(
 
 
 def with_interactions(
-    levels: Levels,
+    levels: NoiseProfile,
     selection: Selection,
     judged: list[Gate],
     attach: Callable[..., Setup],
@@ -69,11 +69,11 @@ def with_interactions(
 ) -> tuple[Selection, list[Gate]]:
     """Look once more whether what is left is a function of two arguments."""
     known = selection.remainder[1] if selection.remainder else 0.0
-    told = lambda text: terminal.line(text, "search")  # noqa: E731
-    found = interaction(levels, attach, options.lanes, told, known)
+    report = lambda text: terminal.line(text, "search")  # noqa: E731
+    found = interaction(levels, attach, options.lanes, report, known)
     if found is None:
         return selection, judged
-    _told(
+    _report_gate(
         f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}",
         found.gate,
         terminal,
@@ -83,13 +83,13 @@ def with_interactions(
         return selection, judged
     gone = [levels.search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in found.kept]
     if gone:
-        told(f"beside it {' and '.join(gone)} is not needed")
+        report(f"beside it {' and '.join(gone)} is not needed")
         selection = cut(levels.search, selection, found.kept)
         judged = [judged[i] for i in found.kept]
     return selection._replace(remainder=(found.term, found.gain)), judged
 
 
-def _told(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
+def _report_gate(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
     why = "" if judged.passed else ", the errors ahead grow" if judged.harm else ", not certain"
     terminal.line(
         f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"

@@ -13,7 +13,7 @@ from simpel_cli.discovery.search.initial_states import begun, moved
 from simpel_cli.discovery.search.outliers import gated, without_new
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import Key, Setup, key_of, test_windows
-from simpel_cli.discovery.search.shortlist import MOST_KNOBS, shortlist
+from simpel_cli.discovery.search.shortlist import MOST_PARAMETERS, shortlist
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
@@ -25,21 +25,21 @@ def shortlisted(
     attach: Callable[..., Setup], terms: Sequence[Term], options: Discovery, terminal: Terminal
 ) -> frozenset[Key] | None:
     """Say which terms get a place in the program; None: all of them."""
-    unknowns = sum(len(t.knobs) for t in terms)
-    if unknowns <= MOST_KNOBS:
+    unknowns = sum(len(t.parameters) for t in terms)
+    if unknowns <= MOST_PARAMETERS:
         return None
     terminal.line(
         f"{len(terms)} terms with {unknowns} unknowns: calibrating the simulator alone, to choose", "screening"
     )
     plan = attach(kept=frozenset())
     width = len(plan.augmented.model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, lanes=options.lanes, width=width)
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
     base = Search(plan, fitter).base()
     forces = Forces(plan.rule, plan.coordinates, plan.augmented.model.dt)
     z = base.optimum.z
     force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
     kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
-    left = sum(len(t.knobs) for t in terms if key_of(t) in kept)
+    left = sum(len(t.parameters) for t in terms if key_of(t) in kept)
     terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
     return kept
 
@@ -53,9 +53,9 @@ def calibrated(
     if plan.spare is not None:
         raw["spare"] = plan.spare
     cut = {split: begun(assessor, plan.start, windows) for split, windows in raw.items()}
-    told = lambda text: terminal.line(text, "search")  # noqa: E731
+    report = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):
-        search = Search(plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), told)
+        search = Search(plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), report)
         base = search.base()
         z = base.optimum.z
         # where hidden states begin was guessed with parameters from the middle of their ranges
@@ -67,5 +67,5 @@ def calibrated(
         if settled:
             break
     search.plan = search.plan._replace(spare=cut.get("spare"))
-    told("calibrated")
+    report("calibrated")
     return search, base, cut["test"], clean

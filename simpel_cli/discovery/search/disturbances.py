@@ -1,11 +1,11 @@
-"""Forces that go with time and nothing else: a swing that no state and no input tells of.
+"""Time-dependent disturbances: forces that no state and no input explains.
 
     force(t) = c cos(w t) + s sin(w t)
 
 with its own c and s in every window, so that the rig's clock need not be known, N(0, a^2) of a few sizes a. What it would
-earn in evidence is told to first order for every frequency w (`levels`), all equally probable. White process noise, which
-the model has, spreads over all frequencies what a swing has at one. What wanders has several: where another frequency is
-left beside the best, or less than a period fits into a window, there is no period to speak of.
+earn in evidence is known to first order for every frequency w (`levels`), all equally probable. White process noise, which
+the model has, spreads over all frequencies what a periodic disturbance has at one. What wanders has several: where another
+frequency is left beside the best, or less than a period fits into a window, there is no period to speak of.
 
 Reference: Bretthorst (1988), Bayesian spectrum analysis and parameter estimation, ch. 3.
 """
@@ -15,17 +15,19 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.likelihood.sensitivity import shifts
-from simpel_cli.discovery.search.noise_profile import Level, Levels
+from simpel_cli.discovery.search.noise_profile import Level, NoiseProfile
 
 SIZES = (1.0, 0.3, 0.1, 0.03)  # of the typical rate of the state
-CERTAIN = 10.0  # nats that a swing has to earn: it is no candidate of the search, and no episode was held out for it
+CERTAIN = (
+    10.0  # nats that a disturbance has to earn: it is no candidate of the search, and no episode was held out for it
+)
 PER_PERIOD = 4  # rows, at least
 STEP = 0.25  # of one period per window, from a frequency to the next
 MOST_WINDOWS = 200  # for a second look: it is dense in the weights of all windows
-APART = 1.5  # periods per window, from which on another frequency is another swing
+APART = 1.5  # periods per window, from which on another frequency is another disturbance
 
 
-class Swing(NamedTuple):
+class Disturbance(NamedTuple):
     """A force that goes with time.
 
     Args:
@@ -48,7 +50,7 @@ class Swing(NamedTuple):
         return f"swings with time, with a period of about {self.period:.3g} s"
 
 
-class Told(NamedTuple):
+class Statistics(NamedTuple):
     """What the data tell of the weights c, s of W windows at F frequencies, at one level of the noise.
 
     Args:
@@ -62,7 +64,7 @@ class Told(NamedTuple):
     shared: np.ndarray
 
 
-def swing(levels: Levels) -> Swing | None:
+def time_dependent_disturbance(levels: NoiseProfile) -> Disturbance | None:
     """Return the force of time that the data ask for beside the chosen terms; None where there is none."""
     plan = levels.search.plan
     model, ok = plan.augmented.model, plan.windows.ok
@@ -76,22 +78,22 @@ def swing(levels: Levels) -> Swing | None:
         name = model.states[row].name
         sizes = np.array(SIZES) * plan.scales.rate[name]
         tried = [_columns(level, cycles / rows, row, model.dt) for level in here]
-        told = [_told(level, columns) for level, columns in zip(here, tried, strict=True)]
-        reached = np.array([level.reached + _evidence(t, sizes)[0] for level, t in zip(here, told, strict=True)])
+        statistics = [_statistics(level, columns) for level, columns in zip(here, tried, strict=True)]
+        reached = np.array([level.reached + _evidence(t, sizes)[0] for level, t in zip(here, statistics, strict=True)])
         k, f, size = np.unravel_index(np.argmax(reached), reached.shape)
         penalty = np.log(len(SIZES) * len(cycles) * len(plan.coordinates.driven))
         gain = float(reached[k, f, size] - max(level.reached for level in here) - penalty)
-        weights = _evidence(Told(*(a[[f]] for a in told[k])), sizes[[size]])[1]
+        weights = _evidence(Statistics(*(a[[f]] for a in statistics[k])), sizes[[size]])[1]
         wanders = bool(cycles[f] < 1)
         others = np.abs(cycles - cycles[f]) > APART
         if len(ok) <= MOST_WINDOWS and others.any() and gain > CERTAIN:
             # what is left beside it, at the level of the noise where it does best
-            beside = _told(_without(here[k], tried[k][..., f]), tried[k][..., others])
+            beside = _statistics(_without(here[k], tried[k][..., f]), tried[k][..., others])
             wanders |= bool(_evidence(beside, sizes)[0].max() - penalty > CERTAIN)
         phase = 2 * np.pi * cycles[f] / rows * np.arange(ok.shape[1])
         force = weights[0] @ np.stack([np.cos(phase), np.sin(phase)])
         rms = float(np.sqrt(np.mean(force**2)))
-        found.append(Swing(name, None if wanders else float(rows * model.dt / cycles[f]), rms, gain))
+        found.append(Disturbance(name, None if wanders else float(rows * model.dt / cycles[f]), rms, gain))
     best = max(found, key=lambda seen: seen.gain, default=None)
     return best if best is not None and best.gain > CERTAIN else None
 
@@ -115,34 +117,34 @@ def _columns(level: Level, frequencies: np.ndarray, row: int, dt: float) -> np.n
     return columns.reshape(count, -1, 2, len(frequencies)) / straight
 
 
-def _told(level: Level, columns: np.ndarray) -> Told:
+def _statistics(level: Level, columns: np.ndarray) -> Statistics:
     count = len(columns)
     known = level.known.reshape(count, columns.shape[1], -1)
     error = level.error.reshape(count, -1)
     # a window's weights move its own innovations alone; only the known unknowns, taken out, tie the windows together
-    return Told(
+    return Statistics(
         np.einsum("wmaf,wmbf->fwab", columns, columns, optimize=True),
         np.einsum("wmaf,wm->fwa", columns, error),
         np.einsum("wmn,wmaf->fnwa", known, columns, optimize=True),
     )
 
 
-def _evidence(told: Told, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _evidence(statistics: Statistics, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence that the weights earn, nats, (F, sizes), and their posterior means at the last size, (F, W, 2).
 
     As `levels.evidence` with W' W = square - shared' shared, by the matrix inversion and determinant lemmas.
     """
     found = []
-    weights = np.zeros_like(told.pull)
+    weights = np.zeros_like(statistics.pull)
     for a2 in np.square(sizes):
-        inverse = np.linalg.inv(np.eye(2) + a2 * told.square)
-        turned = np.einsum("fwab,fnwb->fnwa", inverse, told.shared)
-        inner = np.eye(told.shared.shape[1]) - a2 * np.einsum("fnwa,fmwa->fnm", told.shared, turned)
-        own = np.einsum("fwab,fwb->fwa", inverse, told.pull)
-        tie = np.einsum("fnwa,fwa->fn", told.shared, own)
+        inverse = np.linalg.inv(np.eye(2) + a2 * statistics.square)
+        turned = np.einsum("fwab,fnwb->fnwa", inverse, statistics.shared)
+        inner = np.eye(statistics.shared.shape[1]) - a2 * np.einsum("fnwa,fmwa->fnm", statistics.shared, turned)
+        own = np.einsum("fwab,fwb->fwa", inverse, statistics.pull)
+        tie = np.einsum("fnwa,fwa->fn", statistics.shared, own)
         weights = a2 * (own + a2 * np.einsum("fnwa,fn->fwa", turned, np.linalg.solve(inner, tie[..., None])[..., 0]))
         size = -np.log(np.linalg.det(inverse)).sum(axis=1) + np.linalg.slogdet(inner)[1]
-        found.append(np.einsum("fwa,fwa->f", told.pull, weights) / 2 - size / 2)
+        found.append(np.einsum("fwa,fwa->f", statistics.pull, weights) / 2 - size / 2)
     value = np.stack(found, axis=1)
     return np.where(np.isfinite(value), value, -np.inf), weights
 

@@ -92,9 +92,9 @@ def reduction_interval(
     chosen = random.integers(0, len(names), (draws, len(names)))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
-    told = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
+    measured = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
     interval = np.full((2, ratio.shape[1]), np.nan)
-    interval[:, told] = np.nanquantile(ratio[:, told], [0.025, 0.975], axis=0)
+    interval[:, measured] = np.nanquantile(ratio[:, measured], [0.025, 0.975], axis=0)
     return interval
 
 

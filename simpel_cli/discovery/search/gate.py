@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Lane
+from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -54,16 +54,18 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     folds = (
         [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))] if len(order) > 1 else []
     )
-    lanes = [Lane(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
-    found = search.fitter(lanes)
+    hypotheses = [Hypothesis(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
+    found = search.fitter(hypotheses)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
-    found = search.fitter([Lane(o.z, search.noise, 1 - lane.weight) for o, lane in zip(found, lanes, strict=True)])
+    found = search.fitter(
+        [Hypothesis(o.z, search.noise, 1 - hypothesis.weight) for o, hypothesis in zip(found, hypotheses, strict=True)]
+    )
     scored = [
         (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)]) for i, out in enumerate(folds)
     ]
     if unit == "window" and search.plan.spare is not None:
         for names, part, out in _batches(search.plan.spare, len(groups)):
-            fits = search.fitter.on(part)([Lane(t.optimum.z, search.noise, out.astype(float)) for t in trials])
+            fits = search.fitter.on(part)([Hypothesis(t.optimum.z, search.noise, out.astype(float)) for t in trials])
             scored.append((part, out, len(groups) + names, fits))
     if not scored:
         return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]

@@ -41,10 +41,10 @@ def begun(assessor: Assessor, z: np.ndarray, windows: Windows) -> Windows:
             break
         mean = found.mean[:, 0][:, hidden]
         sd = np.sqrt(np.maximum(np.stack([found.cov[:, 0, i, i] for i in hidden], axis=1), 0.0))
-        told = np.isfinite(mean) & np.isfinite(sd)
+        known = np.isfinite(mean) & np.isfinite(sd)
         start, spread = windows.start.copy(), windows.spread.copy()
-        start[:, hidden] = np.where(told, np.clip(mean, low, high), start[:, hidden])
-        spread[:, hidden] = np.where(told, np.clip(WIDE * sd, LEAST * first, MOST * first), spread[:, hidden])
+        start[:, hidden] = np.where(known, np.clip(mean, low, high), start[:, hidden])
+        spread[:, hidden] = np.where(known, np.clip(WIDE * sd, LEAST * first, MOST * first), spread[:, hidden])
         windows = windows._replace(start=start, spread=spread)
     return windows
 

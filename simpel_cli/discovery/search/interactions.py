@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Fitter, Lane
+from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.gate import Gate, gates
-from simpel_cli.discovery.search.noise_profile import Levels
+from simpel_cli.discovery.search.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.pair_screening import Promise, promised
 from simpel_cli.discovery.search.setup import Key, Setup, key_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search
@@ -42,10 +42,10 @@ class Interaction(NamedTuple):
 
 
 def interaction(
-    levels: Levels,
+    levels: NoiseProfile,
     attach: Callable[..., Setup],
-    lanes: int,
-    told: Callable[[str], None] = lambda _: None,
+    side_by_side: int,
+    report: Callable[[str], None] = lambda _: None,
     known: float = 0.0,
 ) -> Interaction | None:
     """Return the function of two arguments that the data ask for beside the chosen terms; None where there is none.
@@ -53,8 +53,8 @@ def interaction(
     Args:
         levels: of the model that a search ended with.
         attach: (kept, extra) -> the setup of a program with these terms alone.
-        lanes: fits that run side by side.
-        told: is told what goes on.
+        side_by_side: fits that run side by side.
+        report: takes a line that says what goes on.
         known: evidence that a function of one argument earns there, which one of two has to beat, nats.
     """
     search, assessor, chosen = levels.search, levels.assessor, levels.chosen
@@ -66,18 +66,24 @@ def interaction(
     going = _worth_a_fit(promised(levels, terms), terms, known + ACCEPT)
     if not going:
         return None
-    told("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
+    report("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
     kept = {key_of(search.terms[t]) for t in chosen.terms}
     plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows, spare=search.plan.spare)
     _, n_r, n_q = plan.coordinates.sizes
-    knobs = sum(len(search.terms[t].knobs) for t in chosen.terms) + max(len(t.knobs) for t in going)
+    unknowns = sum(len(search.terms[t].parameters) for t in chosen.terms) + max(len(t.parameters) for t in going)
     small = Search(
         plan,
-        Fitter(plan.rule, plan.coordinates, plan.windows, lanes=lanes, width=len(model.params) + n_r + n_q + knobs),
+        Fitter(
+            plan.rule,
+            plan.coordinates,
+            plan.windows,
+            side_by_side=side_by_side,
+            width=len(model.params) + n_r + n_q + unknowns,
+        ),
     )
     names = [key_of(t) for t in small.terms]
     own = tuple(names.index(key_of(search.terms[t])) for t in chosen.terms)
-    start = Lane(carried(search.plan, chosen.optimum.z, plan), small.free(own), small.ones)
+    start = Hypothesis(carried(search.plan, chosen.optimum.z, plan), small.free(own), small.ones)
     before = small.best(own, small.fitter([start]))
     trials = small.add(before, [names.index(key_of(t)) for t in going]).trials
     search.tried += len(going)
@@ -85,7 +91,9 @@ def interaction(
         return None
     whole, new = trials[0], trials[0].terms[-1]
     # so that the smaller model has had every chance that the larger one had
-    before = small.best(own, small.fitter([Lane(small.off(whole.optimum.z, (new,)), small.free(own), small.ones)]))
+    before = small.best(
+        own, small.fitter([Hypothesis(small.off(whole.optimum.z, (new,)), small.free(own), small.ones)])
+    )
     if not whole.optimum.log_evidence - before.optimum.log_evidence > known + ACCEPT:
         return None
     after = small.prune(whole)[0]  # an effect that was named for want of this function is needed no longer
@@ -111,7 +119,7 @@ def _worth_a_fit(promises: Sequence[Promise], terms: Sequence[Term], least: floa
 
 def sized(term: Term, size: float) -> Term:
     """Return a function with that share of the standard deviations of its weights."""
-    return term._replace(knobs=tuple(k._replace(low=size * k.low, high=size * k.high) for k in term.knobs))
+    return term._replace(parameters=tuple(k._replace(low=size * k.low, high=size * k.high) for k in term.parameters))
 
 
 def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:

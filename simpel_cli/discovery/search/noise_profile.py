@@ -47,7 +47,7 @@ class Level(NamedTuple):
     per_std: np.ndarray
 
 
-class Levels:
+class NoiseProfile:
     """A chosen model at every level of the noise of one state; what was computed is kept."""
 
     def __init__(self, search: Search, assessor: Assessor, chosen: Trial) -> None:
@@ -77,8 +77,8 @@ class Levels:
     def _at(self, z: np.ndarray) -> list[Level]:
         windows = self.search.plan.windows
         ok = windows.ok > 0
-        told = self.assessor(z, windows)
-        innovation, variance = (np.asarray(a) for a in (told.track.innovation, told.track.variance))
+        assessed = self.assessor(z, windows)
+        innovation, variance = (np.asarray(a) for a in (assessed.track.innovation, assessed.track.variance))
         with np.errstate(invalid="ignore", divide="ignore"):
             per_std = np.where(ok, 1 / np.sqrt(variance), 0.0)
         error = np.where(ok, innovation, 0.0) * per_std
@@ -89,9 +89,9 @@ class Levels:
         u, size, _ = np.linalg.svd(directions.reshape(error.size, -1), full_matrices=False)
         known = u[:, size**2 > LEAST_CURVATURE]  # what the data tell of them; elsewhere the prior holds them
         left = error.ravel() - known @ (known.T @ error.ravel())
-        reached = float(told.log_likelihood.sum() + 0.5 * (np.sum(error**2) - left @ left))
+        reached = float(assessed.log_likelihood.sum() + 0.5 * (np.sum(error**2) - left @ left))
         known = known.reshape(*error.shape, -1)
-        return [Level(reached, told.track, self.inputs, left.reshape(error.shape), known, per_std)]
+        return [Level(reached, assessed.track, self.inputs, left.reshape(error.shape), known, per_std)]
 
     def _moves(self, z: np.ndarray, innovation: np.ndarray) -> list[np.ndarray]:
         """Change of the innovations per unknown of the chosen model, (W, T, ny) each; 0 where nothing was measured."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from simpel_cli.discovery.likelihood.augmented import Augmented, augment
 from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
-from simpel_cli.discovery.search.noise_profile import Level, Levels, evidence
+from simpel_cli.discovery.search.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.discovery.search.trials import Search, Trial
 from simulators.effects import Term
 
@@ -25,7 +25,7 @@ class Promise(NamedTuple):
     size: float
 
 
-def promised(levels: Levels, terms: Sequence[Term]) -> list[Promise]:
+def promised(levels: NoiseProfile, terms: Sequence[Term]) -> list[Promise]:
     """Return what every function would earn beside the chosen terms.
 
     Args:

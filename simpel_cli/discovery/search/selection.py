@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Lane
+from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, TIE, Search, Stage, Trial, asked
 from simulators.effects import Term
 
 MOST_EFFECTS = 8
 MOST_MERGERS = 2
 MOST_AGAIN = 3
-MOST_HOPES = 8  # effects that a search could begin with
+MOST_RUNNERS_UP = 8  # effects that a search could begin with
 BEGINNINGS = 2  # that it does begin with, beside the one that explains most
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 
@@ -85,7 +85,7 @@ def _settled(search: Search, grown: _Grown) -> Selection:
         if stage is None or _nameless(search, stage.trials[0]) or merger == MOST_MERGERS:
             break
         whole = stage.trials[0]
-        search.told(f"{search.terms[whole.terms[-1]].label} in place of two")
+        search.report(f"{search.terms[whole.terms[-1]].label} in place of two")
         again = _grow(search, _path(search, whole))
         grown = again._replace(stages=(*grown.stages, stage, *again.stages))
     path = _path(search, chosen)
@@ -105,7 +105,7 @@ def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, 
         first = next((t for t in grown.path[:-1] if set(t.terms) == set(chosen.terms)), None)
         if first is None or not chosen.optimum.log_evidence > first.optimum.log_evidence + ASTRAY:
             return grown, chosen, gains, without
-        search.told(
+        search.report(
             f"without what was added it fits {chosen.optimum.log_evidence - first.optimum.log_evidence:.0f} nats better"
         )
         again = _grow(search, _path(search, chosen))
@@ -133,7 +133,7 @@ def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
         if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
             again = search.fitter(
                 [
-                    Lane(search.off(t.optimum.z, t.terms[-1:]), search.free(current.terms), search.ones)
+                    Hypothesis(search.off(t.optimum.z, t.terms[-1:]), search.free(current.terms), search.ones)
                     for t in trials[:4]
                 ]
             )
@@ -153,7 +153,7 @@ def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
                 remainder = (search.terms[unnamed.terms[-1]], float(gain_unnamed))
             return _Grown(path, tuple(stages), remainder)
         path = (*path, best)
-        search.told(f"{search.terms[best.terms[-1]].label} +{gain:.0f}")
+        search.report(f"{search.terms[best.terms[-1]].label} +{gain:.0f}")
 
 
 def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
@@ -164,16 +164,16 @@ def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
     first, begun = grown.stages[0], grown.path[1:2]
     least = first.before.optimum.log_evidence + ACCEPT
     others = [t for t in first.trials if not _nameless(search, t) and not any(_holds(search, t, b) for b in begun)]
-    hopes = [(t, _hope(search, t)) for t in others[:MOST_HOPES] if t.optimum.log_evidence > least]
-    seen = [(t.optimum.log_evidence, _hope(search, t)) for t in begun]
+    runners_up = [(t, _best_next_gain(search, t)) for t in others[:MOST_RUNNERS_UP] if t.optimum.log_evidence > least]
+    seen = [(t.optimum.log_evidence, _best_next_gain(search, t)) for t in begun]
     tried = 0
-    for trial, hope in sorted(hopes, key=lambda found: -found[0].optimum.log_evidence - found[1]):
-        here = trial.optimum.log_evidence, hope
+    for trial, next_gain in sorted(runners_up, key=lambda found: -found[0].optimum.log_evidence - found[1]):
+        here = trial.optimum.log_evidence, next_gain
         if tried == most or any(np.allclose(here, there, rtol=0, atol=TIE / 2) for there in seen):
             continue
         seen.append(here)
         tried += 1
-        search.told(f"beginning with {search.terms[trial.terms[-1]].label}")
+        search.report(f"beginning with {search.terms[trial.terms[-1]].label}")
         other = _grow(search, (grown.path[0], trial))
         yield other._replace(stages=(first, *other.stages))
 
@@ -184,7 +184,7 @@ def _holds(search: Search, trial: Trial, begun: Trial) -> bool:
     return trial.terms == begun.terms or (own.effect in term.generalises and own.acts_on == term.acts_on)
 
 
-def _hope(search: Search, trial: Trial) -> float:
+def _best_next_gain(search: Search, trial: Trial) -> float:
     """Return what the best next effect promises beside a trial's, nats."""
     named = [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on]
     gains = [score.gain for score in search.promises(trial, search.starts(trial, named))]
@@ -205,8 +205,10 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
         # with two terms less the noise may have settled elsewhere: the best begin once more with that of the chosen model
         z = search.off(chosen.optimum.z, pair)
         again = [t for t in stage.trials if not _nameless(search, t)][:MOST_AGAIN]
-        lanes = [(t.terms, lane) for t in again for lane in search.lanes(t.terms, t.terms[-1], z)]
-        for (terms, _), optimum in zip(lanes, search.fitter([lane for _, lane in lanes]), strict=True):
+        hypotheses = [(t.terms, hypothesis) for t in again for hypothesis in search.hypotheses(t.terms, t.terms[-1], z)]
+        for (terms, _), optimum in zip(
+            hypotheses, search.fitter([hypothesis for _, hypothesis in hypotheses]), strict=True
+        ):
             search.best(terms, [optimum])
         trials = sorted((search.best(t.terms, ()) for t in stage.trials), key=lambda t: -t.optimum.log_evidence)
         stage, named = stage._replace(trials=tuple(trials)), search.best_named(trials)
@@ -273,7 +275,7 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
     function, own = rival.terms[-1], chosen.terms[i]
     what, depends_on = search.terms[own].label, " and ".join(search.terms[function].depends_on)
     if not search.fits((*chosen.terms, function)):
-        search.told(f"{what}: a function of {depends_on} does better; no room for both (discovery.room)")
+        search.report(f"{what}: a function of {depends_on} does better; no room for both (discovery.room)")
         return rival
     terms = (*chosen.terms, function)
     starts = []
@@ -281,13 +283,13 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
         z = search.loud(z)
         rows = list(search.rows[new])
         z[rows] = other.optimum.z[rows]
-        starts.append(Lane(z, search.free(terms), search.ones))
+        starts.append(Hypothesis(z, search.free(terms), search.ones))
     whole = search.best(terms, search.fitter(starts))
     rest = (*(t for t in chosen.terms if t != own), function)
     part = search.best(rest, search.fitter(search.less(whole, rest)))
     earned = whole.optimum.log_evidence - part.optimum.log_evidence
     stays = earned >= asked(len(chosen.terms))
-    search.told(f"{what}: a function of {depends_on} does better{f', beside it +{earned:.0f}' if stays else ''}")
+    search.report(f"{what}: a function of {depends_on} does better{f', beside it +{earned:.0f}' if stays else ''}")
     return whole if stays else None
 
 

@@ -84,7 +84,7 @@ def setup(
     terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)] + list(extra)
     augmented = augment(model, terms, measured)
     # of all of them, so that windows do not depend on what is kept
-    longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.knobs), default=0.0)
+    longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.parameters), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
     if any(t.kind == BACKLASH for t in every):
         lead = max(lead, PLAY_ROWS)
@@ -114,10 +114,10 @@ def setup(
     )
     n_p, n_r, n_q = coordinates.sizes
     start = np.full(len(coordinates.low), 0.5)
-    knobs = np.arange(len(model.params), n_p)
-    span = coordinates.high[knobs] - coordinates.low[knobs]
+    effect_rows = np.arange(len(model.params), n_p)  # parameters of effects
+    span = coordinates.high[effect_rows] - coordinates.low[effect_rows]
     # not cut to the bounds: a neutral value may lie beyond them
-    start[knobs] = (augmented.neutral[knobs] - coordinates.low[knobs]) / np.where(span > 0, span, 1.0)
+    start[effect_rows] = (augmented.neutral[effect_rows] - coordinates.low[effect_rows]) / np.where(span > 0, span, 1.0)
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
     return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps)
@@ -140,7 +140,7 @@ def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], 
         named = [t for e in effects for t in e.attach(model, scales, measured)]
     except ModelError as error:
         raise ConfigError(str(error)) from error
-    # what is late already is calibrated: a second delay of the same input could not be told from the first
+    # what is late already is calibrated: a second delay of the same input could not be distinguished from the first
     late = {DELAY: model.delay, LAG: model.lag}
     return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
 

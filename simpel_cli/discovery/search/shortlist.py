@@ -20,7 +20,7 @@ from simpel_cli.discovery.search.setup import Key, Setup, key_of
 from simulators.effects import Term
 from simulators.effects.term import OPERATORS, SENSOR
 
-MOST_KNOBS = 160  # of a program with every term
+MOST_PARAMETERS = 160  # of a program with every term
 NAMED, UNNAMED = 60, 24  # unknowns of named effects and of functions that are kept by their gain
 ROWS = 1000  # looked at
 NUDGE = 1e-4  # of the range of a known parameter
@@ -38,12 +38,12 @@ def shortlist(plan: Setup, z: np.ndarray, force: Force, inputs: np.ndarray, term
     """
     gains = dict(zip(map(key_of, terms), _gains(plan, z, force, inputs, terms), strict=True))
     kept = {key for key, gain in gains.items() if gain == np.inf}
-    for named, room in ((True, NAMED), (False, UNNAMED)):
+    for named, capacity in ((True, NAMED), (False, UNNAMED)):
         ranked = sorted((t for t in terms if bool(t.depends_on) is not named), key=lambda t: -gains[key_of(t)])
         for term in ranked:
-            if key_of(term) not in kept and len(term.knobs) <= room:
+            if key_of(term) not in kept and len(term.parameters) <= capacity:
                 kept.add(key_of(term))
-                room -= len(term.knobs)
+                capacity -= len(term.parameters)
     return frozenset(kept)
 
 
@@ -95,13 +95,13 @@ def _columns(augmented: Augmented, term: Term, at: np.ndarray, rates: Any, still
     place = augmented.rows(term)
     if term.depends_on:
         columns = []
-        for row, knob in zip(place, term.knobs, strict=True):
+        for row, parameter in zip(place, term.parameters, strict=True):
             p = at.copy()
-            p[row] = knob.high
+            p[row] = parameter.high
             columns.append(rates(p) - still)
         yield np.array(columns).T
         return
-    for s in range(max(len(knob.starts) for knob in term.knobs)):
+    for s in range(max(len(parameter.starts) for parameter in term.parameters)):
         p = at.copy()
-        p[place] = [knob.starts[min(s, len(knob.starts) - 1)] for knob in term.knobs]
+        p[place] = [parameter.starts[min(s, len(parameter.starts) - 1)] for parameter in term.parameters]
         yield (rates(p) - still)[:, None]

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Fitter, Lane, Optimum
+from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.errors import DataError
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
-TIE = 3.0  # nats within which two names are not told apart
+TIE = 3.0  # nats within which two names are not distinguished
 SAME = 1.0  # nats of log posterior within which only the widths of two priors differ, not what the data say
 PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
 SHARE = 0.3  # of the largest promise, likewise
@@ -24,7 +24,7 @@ ALIKE = 0.8  # of what the term promises whose place a rival would take
 SHARE_OF_OWN = 0.4  # likewise
 KEPT = 4  # starts of a stage that are fitted in any case
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
-NEARLY = 0.01  # of a knob's range
+NEARLY = 0.01  # of a parameter's range
 QUIETER = 0.1  # of the range of log q, than at the very start
 STARTS = 6  # of the model as it is
 
@@ -52,8 +52,8 @@ class Stage(NamedTuple):
 class Search:
     """The search over sets of effects of one setup."""
 
-    def __init__(self, plan: Setup, fitter: Fitter, told: Callable[[str], None] = lambda _: None) -> None:
-        self.plan, self.fitter, self.told = plan, fitter, told
+    def __init__(self, plan: Setup, fitter: Fitter, report: Callable[[str], None] = lambda _: None) -> None:
+        self.plan, self.fitter, self.report = plan, fitter, report
         self.terms = plan.augmented.terms
         n_p, n_r, n_q = plan.coordinates.sizes
         self.always = tuple(range(len(plan.augmented.model.params))) + tuple(range(n_p, n_p + n_r + n_q))
@@ -72,27 +72,27 @@ class Search:
         """Whether the compiled program has room for them."""
         return len(self.free(terms)) <= self.fitter.width
 
-    def promises(self, before: Trial, starts: Sequence[tuple[int, Lane]]) -> list[Score]:
+    def promises(self, before: Trial, starts: Sequence[tuple[int, Hypothesis]]) -> list[Score]:
         """Return what each start of each term promises beside a fitted set."""
         return promises(self.plan, self.fitter, self.fitter.width, self.free(before.terms), before.optimum.z, starts)
 
-    def lanes(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Lane]:
+    def hypotheses(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Hypothesis]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""
-        knobs = self.terms[new].knobs
-        lanes = []
-        for s in range(max(len(k.starts) for k in knobs)):
+        parameters = self.terms[new].parameters
+        hypotheses = []
+        for s in range(max(len(k.starts) for k in parameters)):
             start = self.loud(z)
-            for row, knob in zip(self.rows[new], knobs, strict=True):
-                start[row] = self.plan.coordinates.unit(row, knob.starts[min(s, len(knob.starts) - 1)])
-            lanes.append(Lane(start, self.free(terms), self.ones))
-        return lanes
+            for row, parameter in zip(self.rows[new], parameters, strict=True):
+                start[row] = self.plan.coordinates.unit(row, parameter.starts[min(s, len(parameter.starts) - 1)])
+            hypotheses.append(Hypothesis(start, self.free(terms), self.ones))
+        return hypotheses
 
-    def beside(self, before: Trial, new: int) -> Lane:
+    def beside(self, before: Trial, new: int) -> Hypothesis:
         """Start of a model with one term more at the optimum without it, the term all but switched off."""
         start = self.loud(before.optimum.z)
         for row in self.rows[new]:
             start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
-        return Lane(start, self.free((*before.terms, new)), self.ones)
+        return Hypothesis(start, self.free((*before.terms, new)), self.ones)
 
     def loud(self, z: np.ndarray) -> np.ndarray:
         """Return a start with noise that a step in the wrong direction can hide in.
@@ -124,7 +124,7 @@ class Search:
             z = self.plan.start.copy()
             z[:n] = random.uniform(0.1, 0.9, n)
             starts.append(z)
-        found = self.fitter([Lane(z, self.free(()), self.ones) for z in starts])
+        found = self.fitter([Hypothesis(z, self.free(()), self.ones) for z in starts])
         if not any(np.isfinite(o.log_evidence) for o in found):
             raise DataError(
                 f"sim: no parameters within the ranges of {self.plan.augmented.model.name} gave the measurements a finite "
@@ -141,9 +141,13 @@ class Search:
         self.known[name] = max([*found, *known], key=lambda o: o.log_evidence)
         return Trial(terms, self.known[name])
 
-    def starts(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Lane]]:
+    def starts(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Hypothesis]]:
         """Return every start of every candidate."""
-        return [(t, lane) for t in candidates for lane in self.lanes((*before.terms, t), t, before.optimum.z)]
+        return [
+            (t, hypothesis)
+            for t in candidates
+            for hypothesis in self.hypotheses((*before.terms, t), t, before.optimum.z)
+        ]
 
     def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING) -> Stage:
         """Fit `before` with one of the candidates more, each from its promising starts; best first.
@@ -201,13 +205,13 @@ class Search:
         taken = self.banned.union(terms)
         return [t for t in range(len(self.terms)) if t not in taken and self.fits((*terms, t))]
 
-    def less(self, current: Trial, rest: tuple[int, ...]) -> list[Lane]:
+    def less(self, current: Trial, rest: tuple[int, ...]) -> list[Hypothesis]:
         """Starts of a set of terms that has fewer than the current one."""
         z = self.off(current.optimum.z, tuple(t for t in current.terms if t not in rest))
         n_p, n_r, n_q = self.plan.coordinates.sizes
         loud = z.copy()  # the noise that the terms explained has to go somewhere
         loud[n_p + n_r : n_p + n_r + n_q] = self.plan.start[n_p + n_r : n_p + n_r + n_q]
-        return [Lane(z, self.free(rest), self.ones), Lane(loud, self.free(rest), self.ones)]
+        return [Hypothesis(z, self.free(rest), self.ones), Hypothesis(loud, self.free(rest), self.ones)]
 
     def part(self, current: Trial, rest: tuple[int, ...]) -> Trial:
         """Return the best fit of some of a model's terms, which is made if there is none yet."""
@@ -227,8 +231,8 @@ class Search:
     def without(self, current: Trial) -> list[Trial]:
         """Fit every set that lacks one of the terms."""
         sets = [tuple(t for t in current.terms if t != gone) for gone in current.terms]
-        lanes = [lane for rest in sets for lane in self.less(current, rest)]
-        found = self.fitter(lanes)
+        hypotheses = [hypothesis for rest in sets for hypothesis in self.less(current, rest)]
+        found = self.fitter(hypotheses)
         return [self.best(rest, found[2 * i : 2 * i + 2]) for i, rest in enumerate(sets)]
 
     def rivals(self, chosen: Trial, rest: Trial) -> tuple[Trial, ...]:
@@ -246,8 +250,8 @@ class Search:
         # what promises as much may be the same to the data: it begins where the chosen model ended, too
         alike = list(dict.fromkeys(t for t, gain in promised if t != own and gain > ALIKE * most))
         z = self.off(chosen.optimum.z, (own,))
-        starts = [(t, lane) for t in alike for lane in self.lanes((*rest.terms, t), t, z)]
-        for (t, _), optimum in zip(starts, self.fitter([lane for _, lane in starts]), strict=True):
+        starts = [(t, hypothesis) for t in alike for hypothesis in self.hypotheses((*rest.terms, t), t, z)]
+        for (t, _), optimum in zip(starts, self.fitter([hypothesis for _, hypothesis in starts]), strict=True):
             self.best((*rest.terms, t), [optimum])
         trials = self.add(rest, candidates, max(PROMISING, SHARE_OF_OWN * most)).trials
         fitted = {t.terms[-1] for t in trials}
@@ -261,5 +265,5 @@ class Search:
             return here.log_evidence >= there.log_evidence + ACCEPT
         if self.terms[own].effect in term.generalises:
             return False
-        fits = len(term.knobs) <= len(self.terms[own].knobs) and here.loss <= there.loss + SAME
+        fits = len(term.parameters) <= len(self.terms[own].parameters) and here.loss <= there.loss + SAME
         return fits or here.log_evidence >= there.log_evidence - TIE

@@ -13,7 +13,7 @@ POINTS = 64
 SAME = 1e-6  # of the larger function
 
 
-def twins(search: Search, chosen: Trial, first: tuple[int, Trial], second: tuple[int, Trial]) -> bool:
+def are_aliases(search: Search, chosen: Trial, first: tuple[int, Trial], second: tuple[int, Trial]) -> bool:
     """Whether two fitted terms do the same, but for a factor, all over the model's ranges.
 
     Args:

@@ -39,15 +39,19 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
         if term.kind in CANNOT:
             continue
         written.append(term)
-        for knob, row in zip(term.knobs, search.rows[index], strict=True):
-            short = knob.label if knob.label not in taken else f"{knob.label}_{term.acts_on.replace(', ', '_')}"
-            short = short if short not in taken else knob.name
+        for parameter, row in zip(term.parameters, search.rows[index], strict=True):
+            short = (
+                parameter.label
+                if parameter.label not in taken
+                else f"{parameter.label}_{term.acts_on.replace(', ', '_')}"
+            )
+            short = short if short not in taken else parameter.name
             taken.add(short)
-            names[knob.name] = short
+            names[parameter.name] = short
             span = interval_of(search, trial, row, Z95)
             low, high = sorted((span["low"], span["high"]))
             parameters[short] = (
-                {"unit": knob.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
+                {"unit": parameter.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
             )
     write = _declared if sim.get("_target_", DECLARED) == DECLARED else _extended
     node = write(sim, name, written, names, parameters)
@@ -62,7 +66,7 @@ def _extended(
     dynamics: dict[str, str] = {}
     for term in terms:
         if term.kind in (DELAY, LAG):
-            inputs.setdefault(term.acts_on, {})[term.kind] = names[term.knobs[0].name]
+            inputs.setdefault(term.acts_on, {})[term.kind] = names[term.parameters[0].name]
         elif term.kind == INPUT:
             before = inputs.setdefault(term.acts_on, {}).get("value", term.acts_on)
             inputs[term.acts_on]["value"] = _renamed(term.expression, names | {term.acts_on: f"({before})"})
@@ -85,7 +89,7 @@ def _declared(
     for term in terms:
         if term.kind in (DELAY, LAG):
             own = node["inputs"][term.acts_on]
-            node["inputs"][term.acts_on] = own | {term.kind: names[term.knobs[0].name]}
+            node["inputs"][term.acts_on] = own | {term.kind: names[term.parameters[0].name]}
         elif term.kind == INPUT:
             own = {term.acts_on: given.get(term.acts_on, term.acts_on)}
             given[term.acts_on] = f"({_renamed(term.expression, names | own)})"

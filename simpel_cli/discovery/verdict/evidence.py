@@ -39,13 +39,13 @@ GRID = 101  # points of an effect's curve
 
 
 class Exhibit(NamedTuple):
-    """A table: columns, and the units of those that are not told by another column."""
+    """A table: columns, and the units of those that no other column gives."""
 
     columns: Columns
     units: dict[str, str]
 
 
-def exhibits(
+def evidence_tables(
     search: Search,
     selection: Selection,
     assessor: Assessor,

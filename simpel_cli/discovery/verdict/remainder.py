@@ -1,31 +1,31 @@
-"""What is left when the search ends, in words and numbers: a function without a name, a swing, or errors with a memory."""
+"""What is left when the search ends: an unnamed function, a time-dependent disturbance, or autocorrelated errors."""
 
 from typing import Any
 
 import numpy as np
 
 from simpel_cli.discovery.likelihood.whiteness import memory
-from simpel_cli.discovery.search.disturbances import Swing
+from simpel_cli.discovery.search.disturbances import Disturbance
 from simpel_cli.discovery.search.errors_ahead import Assessment
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simulators.effects.expression import per
 
-ALIKE = 0.3  # of an input's variance, at the period of a swing
+ALIKE = 0.3  # of an input's variance, at the period of a disturbance
 
 
 def remainder_of(
-    search: Search, selection: Selection, swing: Swing | None, learnt: Assessment
+    search: Search, selection: Selection, disturbance: Disturbance | None, learnt: Assessment
 ) -> dict[str, Any] | None:
     """Return `remainder` of `verdict.json`; None where nothing is left.
 
     Args:
         search: that was run.
         selection: what it chose, and a function without a name that the data still ask for.
-        swing: a force of time that they ask for.
+        disturbance: a force that depends on time alone; None: there is none.
         learnt: the corrected model on the windows that it was fitted to.
     """
-    found = _function(search, selection) or (swing and _swinging(search, swing))
+    found = _function(search, selection) or (disturbance and _of_time(search, disturbance))
     return found or _followed(search, selection.chosen, learnt)
 
 
@@ -41,7 +41,7 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
     term, gain = selection.remainder
     scale = search.plan.scales.rate[term.acts_on]
     level = noise_of(search, selection.chosen)[1]
-    unit = term.knobs[0].unit
+    unit = term.parameters[0].unit
     return {
         "acts_on": term.acts_on,
         "depends_on": list(term.depends_on),
@@ -53,16 +53,16 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
     }
 
 
-def _swinging(search: Search, swing: Swing) -> dict[str, Any]:
+def _of_time(search: Search, disturbance: Disturbance) -> dict[str, Any]:
     return {
-        "acts_on": swing.acts_on,
+        "acts_on": disturbance.acts_on,
         "depends_on": ["time"],
-        "rms": swing.rms,
-        "unit": _unit(search, swing.acts_on),
-        "log_evidence_gain": swing.gain,
-        "period": swing.period,
-        "description": f"something acts on d({swing.acts_on})/dt, or on a sensor of it, "
-        f"that {swing.how}{_like(search, swing.period)}",
+        "rms": disturbance.rms,
+        "unit": _unit(search, disturbance.acts_on),
+        "log_evidence_gain": disturbance.gain,
+        "period": disturbance.period,
+        "description": f"something acts on d({disturbance.acts_on})/dt, or on a sensor of it, "
+        f"that {disturbance.how}{_like(search, disturbance.period)}",
     }
 
 
@@ -91,9 +91,9 @@ def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, An
     """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
     errors = learnt.one_step / np.sqrt(learnt.variance)
     found = {
-        name: told
+        name: correlated
         for j, name in enumerate(search.plan.augmented.measured)
-        if (told := memory(errors[:, :, j])) is not None
+        if (correlated := memory(errors[:, :, j])) is not None
     }
     if not found:
         return None

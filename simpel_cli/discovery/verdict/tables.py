@@ -173,9 +173,9 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
     """
     own = [(q.name, "", q.unit, q.low, q.high, i) for i, q in enumerate(search.plan.augmented.model.params)]
     added = [
-        (knob.label, search.terms[t].label, knob.unit, knob.low, knob.high, row)
+        (parameter.label, search.terms[t].label, parameter.unit, parameter.low, parameter.high, row)
         for t in selection.chosen.terms
-        for knob, row in zip(search.terms[t].knobs, search.rows[t], strict=True)
+        for parameter, row in zip(search.terms[t].parameters, search.rows[t], strict=True)
     ]
     rows = [
         {"parameter": name, "effect": effect, "unit": unit, "model": model, "range_low": low, "range_high": high}

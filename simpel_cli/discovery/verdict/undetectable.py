@@ -1,10 +1,10 @@
 """Effects that the data cannot show at all, whatever their size: neither found nor ruled out.
 
-At an effect's start points, with everything else that moves refitted, its first knob has the information
+At an effect's start points, with everything else that moves refitted, its first parameter has the information
 
     S = F_kk - F_kb F_bb^-1 F_bk
 
-in units of the knob's range. Below that of the range itself, 12, the data add nothing to what was known before.
+in units of the parameter's range. Below that of the range itself, 12, the data add nothing to what was known before.
 
 Reference: Cox and Hinkley (1974), Theoretical statistics, 9.3 (information on one parameter among several).
 """
@@ -23,7 +23,7 @@ SHOWN = 6  # names in a sentence
 SURPRISING = 1.5  # times the standard deviation that the model claims, on episodes that it did not see
 
 
-def unseen(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[dict[str, str]]:
+def undetectable(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[dict[str, str]]:
     """Return the effects that these data do not test, and why: name, acts_on, reason.
 
     Args:
@@ -33,10 +33,14 @@ def unseen(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[d
     """
     here = set(chosen.terms)
     asked = [t for t in search.candidates(chosen.terms) if not search.terms[t].depends_on and t not in here]
-    starts = [(t, lane) for t in asked for lane in search.lanes((*chosen.terms, t), t, chosen.optimum.z)]
+    starts = [
+        (t, hypothesis) for t in asked for hypothesis in search.hypotheses((*chosen.terms, t), t, chosen.optimum.z)
+    ]
     seen = set()
-    for (t, lane), optimum in zip(starts, search.fitter([lane for _, lane in starts], 1), strict=True):
-        if _information(optimum.fisher, lane.free.index(search.rows[t][0])) >= LEAST_CURVATURE:
+    for (t, hypothesis), optimum in zip(
+        starts, search.fitter([hypothesis for _, hypothesis in starts], 1), strict=True
+    ):
+        if _information(optimum.fisher, hypothesis.free.index(search.rows[t][0])) >= LEAST_CURVATURE:
             seen.add(t)
     still = _still(search, episodes)
     return [

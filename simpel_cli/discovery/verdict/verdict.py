@@ -11,7 +11,7 @@ from simpel_cli.discovery.search.gate import Gate
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.search.trials import Search, Trial, asked
-from simpel_cli.discovery.verdict.aliases import twins
+from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
@@ -124,7 +124,7 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
     rows = search.rows[selection.chosen.terms[i]]
     others = [(search.terms[t.terms[-1]], t) for t in selection.classes[i]]
     own = (selection.chosen.terms[i], selection.chosen)
-    alike = {key_of(other) for other, t in others if twins(search, selection.chosen, own, (t.terms[-1], t))}
+    alike = {key_of(other) for other, t in others if are_aliases(search, selection.chosen, own, (t.terms[-1], t))}
     same = [other.effect for other, _ in others if key_of(other) in alike and other.effect != term.effect]
     members = [{"name": term.effect, "acts_on": term.acts_on, "same": True}] + [
         {"name": t.effect, "acts_on": t.acts_on, "same": key_of(t) in alike or t.effect in term.same_as}
@@ -144,8 +144,8 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         "log_evidence_gain": selection.gains[i],
         "held_out_gain": None if gate is None else gate._asdict(),
         "parameters": {
-            knob.label: interval_of(search, selection.chosen, row) | {"unit": knob.unit}
-            for knob, row in zip(term.knobs, rows, strict=True)
+            parameter.label: interval_of(search, selection.chosen, row) | {"unit": parameter.unit}
+            for parameter, row in zip(term.parameters, rows, strict=True)
         },
         "share_of_residual": float(1 - (after / before) ** 2) if before > 0 else 0.0,
     }
@@ -199,10 +199,10 @@ def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
         size = sd * np.sqrt(2 * (asked(len(selection.chosen.terms) + 1) + occam))
         span = search.plan.coordinates.high[row] - search.plan.coordinates.low[row]
         if size < 1 and not term.depends_on:
-            knob = term.knobs[0]
+            parameter = term.parameters[0]
             rows.append(
-                {"name": term.effect, "acts_on": term.acts_on, "parameter": knob.label,
-                 "smallest_detectable": float(size * span), "unit": knob.unit, "log_evidence_gain": earned}
+                {"name": term.effect, "acts_on": term.acts_on, "parameter": parameter.label,
+                 "smallest_detectable": float(size * span), "unit": parameter.unit, "log_evidence_gain": earned}
             )  # fmt: skip
     return sorted(rows, key=lambda row: (row["name"], row["acts_on"]))
 
@@ -236,12 +236,12 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         case "unexplained":
             return f"The simulator lacks something without a name: {found['remainder']['description']}."
         case _:
-            told = "Nothing is missing that these data could show: the calibrated simulator explains them"
+            text = "Nothing is missing that these data could show: the calibrated simulator explains them"
             if found["process_noise"]["share_after"] < SHAKEN:
-                return f"{told}."
+                return f"{text}."
             return (
-                f"{told} but for what looks like white noise in the rates ({found['process_noise']['after']:.2g} per square "
-                "root of a second): disturbances, or something that changes faster than the rows can show."
+                f"{text} but for what looks like white noise in the rates ({found['process_noise']['after']:.2g} per "
+                "square root of a second): disturbances, or something that changes faster than the rows can show."
             )
 
 

@@ -70,8 +70,8 @@ def _learning_curves(path: Path) -> Any:
     outputs = distinct(r["output"] for r in rows if r["metric"] == "noise_std")
     kernels = [r["value"] for r in rows if r["metric"] == "mean_kernel"]
     # all but constant: the particles do not feel each other, or the kernel's width follows their distance (`median`)
-    told = bool(kernels) and max(kernels) > 1.2 * min(kernels)
-    figure, (loss, *apart, noise) = new_figure(2 + told, beside=len(outputs))
+    has_kernels = bool(kernels) and max(kernels) > 1.2 * min(kernels)
+    figure, (loss, *apart, noise) = new_figure(2 + has_kernels, beside=len(outputs))
     for i, seed in enumerate(distinct(r["seed"] for r in rows)):
         own = [r for r in rows if r["seed"] == seed]
         curve = [(r["step"], r["value"]) for r in own if r["metric"] == "loss"]
