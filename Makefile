@@ -18,7 +18,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install docs demo test test-recordings test-slow lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
+.PHONY: help install docs demo test test-recordings test-slow check lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -47,7 +47,14 @@ test-recordings: install ## Run the tests that need the recordings (SIMPEL_SHARE
 test-slow: install ## Run the long studies that `make test` leaves out
 	$(BIN)/python -m pytest -m slow
 
-lint: install ## Format, lint, layers, types, lock
+check: install ## Before a commit: format, lint, layers, types, quick tests of what changed (under a minute)
+	$(BIN)/ruff format --quiet .
+	$(BIN)/ruff check --quiet .
+	$(BIN)/lint-imports --no-logo >.lint-imports.log || { cat .lint-imports.log; exit 1; }
+	$(BIN)/mypy --no-error-summary
+	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m tests.changed
+
+lint: install ## Check format, lint, layers, types, lock
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports

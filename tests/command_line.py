@@ -107,7 +107,7 @@ def process(cwd: Path, *words: object, timeout: float = PATIENCE) -> Result:
     return Result(child.returncode, out, err)
 
 
-def time_dependent_disturbance(episodes: int = 6, rows: int = 30, dt: float = 0.05) -> list[list[float]]:
+def swing(episodes: int = 6, rows: int = 30, dt: float = 0.05) -> list[list[float]]:
     """Rows (run, t, pos, vel, volts) of a damped cart on a spring."""
     random = np.random.default_rng(0)
     table = []

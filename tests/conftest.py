@@ -1,5 +1,6 @@
 """Strict settings for every test: float64 available, no implicit dtype or rank promotion, shapes checked by beartype."""
 
+import inspect
 import os
 import signal
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ LONGEST = (
     "uninformative_data", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
     "control", "pathwise",
 )  # fmt: skip
+RUNS_A_VERB = {"simpel", "start", "process", "subprocess"}  # names whose use makes a test more than a unit
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs
 
 # tests send Ctrl-C to processes that they start; a shell's background job ignores it, and would hand that on
@@ -30,10 +32,31 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def _runs_a_verb(item: pytest.Function) -> bool:
+    """Whether a test, its fixtures, or functions of its file that they call run `simpel` or start a process."""
+    fixtures = [each.func for found in item._fixtureinfo.name2fixturedefs.values() for each in found]
+    left, seen = [inspect.unwrap(f) for f in (item.function, *fixtures)], set()
+    while left:
+        function = left.pop()
+        if (code := getattr(function, "__code__", None)) is None or code in seen:
+            continue
+        seen.add(code)
+        names = set(code.co_names).union(*(c.co_names for c in code.co_consts if isinstance(c, type(code))))
+        if names & RUNS_A_VERB:
+            return True
+        scope = function.__globals__
+        left += [
+            scope[n] for n in names if inspect.isfunction(scope.get(n)) and scope[n].__module__ == scope["__name__"]
+        ]
+    return False
+
+
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that need recordings; put the longest files first, so that the workers of `make test` end together."""
+    """Mark tests by what they need; put the longest files first, so that the workers of `make test` end together."""
     for item in items:
+        if isinstance(item, pytest.Function) and not _runs_a_verb(item):
+            item.add_marker("unit")
         if "shared" in getattr(item, "fixturenames", ()):
             item.add_marker("needs_recordings")
     rank = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}

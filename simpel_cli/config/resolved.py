@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.runs.manifest import read_manifest, refuse_older
 
 GROUPS = ("sim", "data", "prior", "score", "method", "choices")  # in every configuration that a run keeps
 
@@ -31,8 +32,9 @@ def of_run(directory: Path) -> dict[str, Any]:
     """Read the resolved configuration of a run.
 
     Raises:
-        ConfigError: missing, not YAML, or cut off.
+        ConfigError: missing, not YAML, cut off, or of another version of simpel.
     """
+    refuse_older(directory, read_manifest(directory))
     path = directory / "config.yaml"
     config = load(path)
     if lacking := [group for group in GROUPS if not isinstance(config.get(group), dict)]:

@@ -18,10 +18,10 @@ from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
-from simpel_cli.discovery.search.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.gate import Gate
-from simpel_cli.discovery.search.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.remainder.disturbances import Disturbance, time_dependent_disturbance
+from simpel_cli.discovery.search.remainder.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import setup, terms_of

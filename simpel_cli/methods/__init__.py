@@ -1,0 +1,1 @@
+"""Inference rules, one per file; each binds a problem and returns `init`, `step` and `predict` (`inference.protocols`)."""

@@ -18,6 +18,7 @@ from simpel_cli.runs.files import write_text
 from simpel_cli.runs.lock import locked
 from simpel_cli.runs.settings import Settings
 
+FORMAT = 2  # of a run directory; 1 had configurations with module paths of before the rooms
 PACKAGES = ("simpel", "jax", "jaxlib", "optax", "hydra-core", "omegaconf", "casadi", "mujoco", "numpy", "pyarrow")
 
 
@@ -51,6 +52,7 @@ class Manifest:
     def write(self, status: str, error: str | None = None) -> None:
         """Write the manifest with a status: running, done, interrupted or failed."""
         record = {
+            "format": FORMAT,
             "command": self.command,
             "command_line": _command_line(),
             "status": status,
@@ -102,6 +104,20 @@ class Manifest:
                     self.write("failed", text)
         finally:
             self._lock.close()
+
+
+def refuse_older(directory: Path, record: dict[str, Any]) -> None:
+    """Refuse a run directory whose configuration this version cannot build. Its Parquet files can still be compared.
+
+    Raises:
+        ConfigError: with the version that made it.
+    """
+    if record.get("format", 1) != FORMAT:
+        version = (record.get("versions") or {}).get("simpel", "unknown")
+        raise ConfigError(
+            f"{directory}: made by another version of simpel ({version}, run directory format {record.get('format', 1)}; this "
+            f"version reads format {FORMAT}). Make the run again, or use that version."
+        )
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

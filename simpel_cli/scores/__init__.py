@@ -1,0 +1,1 @@
+"""Estimators of the score of the prior over function values, one per file."""

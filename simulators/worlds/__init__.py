@@ -1,0 +1,1 @@
+"""Worlds: simulators that answer queries, such as MuJoCo, and how they become measurements."""

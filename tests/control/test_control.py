@@ -556,7 +556,7 @@ def test_a_plan_is_good_on_the_whole_and_not_by_a_lucky_particle() -> None:
 
 
 @pytest.fixture(scope="module")
-def time_dependent_disturbance() -> tuple[World, Encoding, Task]:
+def swing() -> tuple[World, Encoding, Task]:
     """The true pendulum of the swing-up."""
     node = of_conf("sim", "pendulum_high_fidelity")
     node["parameters"] |= {"m": 0.6, "l": 0.5, "C_m": 1.1, "c_1": 0.5, "c_2": 0.5}

@@ -65,7 +65,7 @@ def policy_in(folder: Path, encoding: Encoding, task: Task, memory: int) -> Acto
 
 
 @pytest.fixture(scope="module")
-def time_dependent_disturbance() -> tuple[Any, Encoding, Task]:
+def swing() -> tuple[Any, Encoding, Task]:
     model = build(of_conf("sim", "pendulum_high_fidelity"), "sim").model()
     return model, encoding_of(model), build(of_conf("reward", "swing_up"), "reward")
 

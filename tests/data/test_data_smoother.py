@@ -23,7 +23,7 @@ def declared(states: str, dynamics: dict[str, str]) -> Model:
 PENDULUM = declared("phi omega", {"phi": "omega", "omega": "-30*k*sin(phi) + u"})
 
 
-def time_dependent_disturbance(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def swing(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A decaying swing and its speed; the smoother knows no dynamics, so that any smooth motion will do."""
     return 1.2 * np.sin(6 * t) * np.exp(-0.1 * t), 1.2 * np.exp(-0.1 * t) * (6 * np.cos(6 * t) - 0.1 * np.sin(6 * t))
 

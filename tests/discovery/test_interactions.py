@@ -15,8 +15,8 @@ from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
 from simpel_cli.discovery.search.errors_ahead import Assessor
-from simpel_cli.discovery.search.interactions import BASES, carried, names_of
-from simpel_cli.discovery.search.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.remainder.interactions import BASES, carried, names_of
+from simpel_cli.discovery.search.remainder.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection, cut, select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import Setup, key_of, setup

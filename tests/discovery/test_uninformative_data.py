@@ -204,7 +204,7 @@ def recording(states: np.ndarray, **fields: Any) -> Recording:
     return Recording(tuple(episodes[:2]), (episodes[2],), (), noise, (), (), ())._replace(**fields)
 
 
-def time_dependent_disturbance(noise: float = 1e-3) -> np.ndarray:
+def swing(noise: float = 1e-3) -> np.ndarray:
     t = 0.05 * np.arange(80)
     return 0.3 * np.stack([np.sin(t), np.cos(t)], axis=1) + noise * np.random.default_rng(4).normal(size=(80, 2))
 

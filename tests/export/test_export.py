@@ -18,6 +18,7 @@ from simpel_cli.config import nodes
 from simpel_cli.config.places import conf_dir
 from simpel_cli.config.resolved import load
 from simpel_cli.dynamics.transition import encoding_of, transition
+from simpel_cli.runs.manifest import FORMAT
 from simulators.model import Model
 from simulators.step import one_step
 
@@ -166,7 +167,7 @@ def test_the_simulator_that_discover_corrected(fitted: Path, tmp_path: Path) -> 
     my = rig(tmp_path)
     cart = load(my / "sim" / "cart.yaml")
     (run / "config.yaml").write_text(json.dumps(load(fitted / "config.yaml") | {"sim": cart}))
-    (run / "manifest.json").write_text(json.dumps({"command": "discover", "status": "done"}))
+    (run / "manifest.json").write_text(json.dumps({"format": FORMAT, "command": "discover", "status": "done"}))
     (run / "conf" / "sim" / "cart_with_leak.yaml").write_text(
         json.dumps(cart | {"name": "cart_with_leak", "parameters": cart["parameters"] | {"b": {"range": [0.1, 0.3]}}})
     )

@@ -166,6 +166,7 @@ LOOK = """<script>addEventListener("load", () => {
 });</script>"""
 
 
+@pytest.mark.browser
 def test_report_in_a_browser(runs: Path, tmp_path: Path) -> None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import simpel
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.arrays import load_checkpoint, save_checkpoint
@@ -223,3 +224,17 @@ def test_foreign_safetensors_are_refused(tmp_path: Path) -> None:
     save_file({"w": np.zeros(2)}, tmp_path / "state.safetensors", metadata={"other": json.dumps({})})
     with pytest.raises(ConfigError, match="damaged or not a checkpoint of simpel"):
         load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("verb", [("evaluate", "run"), ("export", "run"), ("fit", "--resume", "run")])
+def test_a_run_of_another_version_is_refused_with_a_sentence(tmp_path: Path, verb: tuple[str, ...]) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text("prior: {_target_: simpel_cli.prior.SimulatorPrior}\n")
+    (run / "manifest.json").write_text('{"command": "fit", "status": "done", "versions": {"simpel": "0.0.9"}}')
+    result = simpel(tmp_path, *verb)
+    assert result.code == 2
+    assert (
+        "run: made by another version of simpel (0.0.9, run directory format 1; this version reads format 2)"
+        in result.err
+    )

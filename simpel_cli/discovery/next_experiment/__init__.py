@@ -1,1 +1,1 @@
-"""Which experiment tells tied causes apart."""
+"""The experiment that distinguishes causes which the measurements cannot."""

@@ -1,1 +1,1 @@
-"""Which set of effects explains the measurements: trials, score test, selection, held-out gate, disturbances, pairs."""
+"""Which set of effects explains the measurements: calibration, score test, trials, selection, held-out gate."""

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.gate import Gate, gates
-from simpel_cli.discovery.search.interactions import interaction
-from simpel_cli.discovery.search.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.remainder.interactions import interaction
+from simpel_cli.discovery.search.remainder.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import Setup

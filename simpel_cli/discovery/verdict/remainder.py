@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.discovery.likelihood.whiteness import memory
-from simpel_cli.discovery.search.disturbances import Disturbance
 from simpel_cli.discovery.search.errors_ahead import Assessment
+from simpel_cli.discovery.search.remainder.disturbances import Disturbance
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simulators.effects.expression import per

@@ -13,8 +13,8 @@ import numpy as np
 from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.gate import Gate, gates
-from simpel_cli.discovery.search.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.pair_screening import Promise, promised
+from simpel_cli.discovery.search.remainder.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.remainder.pair_screening import Promise, promised
 from simpel_cli.discovery.search.setup import Key, Setup, key_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search
 from simulators.effects import Term, functions_of_two

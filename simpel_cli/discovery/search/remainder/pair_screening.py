@@ -11,7 +11,7 @@ import numpy as np
 
 from simpel_cli.discovery.likelihood.augmented import Augmented, augment
 from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
-from simpel_cli.discovery.search.noise_profile import Level, NoiseProfile, evidence
+from simpel_cli.discovery.search.remainder.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.discovery.search.trials import Search, Trial
 from simulators.effects import Term
 

@@ -1,0 +1,54 @@
+"""The structure that a newcomer relies on: rooms that say what is in them, short files, imports without circles."""
+
+import ast
+from pathlib import Path
+
+import grimp
+import pytest
+from command_line import ROOT
+
+PACKAGE = ROOT / "simpel_cli"
+MODULES = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "simulators").rglob("*.py")])
+ROOMS = sorted({path.parent for path in MODULES})
+
+
+def lines(path: Path) -> int:
+    return len(path.read_text().splitlines())
+
+
+def test_nothing_lies_loose() -> None:
+    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "errors.py", "main.py"}
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: str(room.relative_to(ROOT)))
+def test_a_room_says_what_is_in_it(room: Path) -> None:
+    says = ast.get_docstring(ast.parse((room / "__init__.py").read_text()))
+    assert says
+    assert says.endswith(".")
+
+
+def test_files_are_short() -> None:
+    assert {str(path.relative_to(ROOT)): lines(path) for path in MODULES if lines(path) > 400} == {}
+    assert {path.name: lines(path) for path in (PACKAGE / "commands").glob("*.py") if lines(path) > 120} == {}
+
+
+def test_every_file_says_what_is_in_it() -> None:
+    assert [str(p.relative_to(ROOT)) for p in MODULES if not ast.get_docstring(ast.parse(p.read_text()))] == []
+
+
+def test_no_circle_between_files() -> None:
+    """Imports inside functions count, too."""
+    graph = grimp.build_graph("simpel_cli", "simulators", cache_dir=None)
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    left = dict(imports)
+    while ends := [module for module, others in left.items() if not any(other in left for other in others)]:
+        for module in ends:
+            del left[module]
+    assert sorted(left) == []
+
+
+def test_tests_stand_in_the_rooms_of_the_code() -> None:
+    rooms = {path.name for path in PACKAGE.iterdir() if path.is_dir()} | {"simulators"}
+    others = {"project"}  # what is shipped, and the whole
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        assert path.parent.name in rooms | others, path
