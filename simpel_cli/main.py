@@ -11,9 +11,9 @@ from simpel_cli.commands.doctor import doctor
 from simpel_cli.commands.effects import effects
 from simpel_cli.commands.evaluate import evaluate
 from simpel_cli.commands.example import example
+from simpel_cli.commands.exit_codes import run
 from simpel_cli.commands.export import export
 from simpel_cli.commands.fit import fit
-from simpel_cli.commands.outcome import run
 from simpel_cli.commands.report import report
 from simpel_cli.commands.rl_offline import rl_offline
 from simpel_cli.commands.rl_online import rl_online
@@ -46,7 +46,10 @@ def _simpel(
         bool | None, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = None,
 ) -> None:
-    """Simulation priors for data-efficient learning: fit, judge and compare Bayesian models of measured systems."""
+    """Accurate models and control policies from a rough simulator and a few measurements.
+
+    Start with `simpel doctor` and `simpel fit experiment=pendulum`. Every verb has `--help` with examples.
+    """
 
 
 for verb in (

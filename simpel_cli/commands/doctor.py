@@ -2,7 +2,13 @@
 
 
 def doctor() -> None:
-    """Tell what this installation has, and test in a few seconds whether it computes right."""
+    """Show what this installation consists of, and test in a few seconds whether it computes correctly.
+
+    Examples:
+      simpel doctor
+
+      simpel doctor > installation.txt
+    """
     from simpel_cli.reporting.doctor import doctor as task
 
     task()

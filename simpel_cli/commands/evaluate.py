@@ -5,18 +5,18 @@ from typing import Annotated
 
 import typer
 
-from simpel_cli.commands.launching import launch
 from simpel_cli.commands.options import Cfg, ConfigDir, Overrides
+from simpel_cli.commands.starting import launch
 from simpel_cli.errors import ConfigError
 
 
 def evaluate(
-    run_dir: Annotated[Path, typer.Argument(help="Directory of a fit.")],
+    run_dir: Annotated[Path, typer.Argument(help="Directory of a run of fit.")],
     overrides: Overrides = None,
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
 ) -> None:
-    """Judge a fitted model on its held-out episodes, or on all of a new file.
+    """Test a fitted model on its held-out episodes, or on every episode of a new file.
 
     Examples:
       simpel evaluate runs/fit/pendulum/20261121-101502-3fa9

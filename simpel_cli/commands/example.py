@@ -9,10 +9,12 @@ import typer
 def example(
     folder: Annotated[Path, typer.Argument(help="A new or empty folder.")],
 ) -> None:
-    """Write the folder of a rig, to be changed into your own: simulator, measurements, effect, task, experiment.
+    """Write a complete example into a new folder: simulator, measurements, effect, task and experiment, for you to change.
 
     Examples:
       simpel example my
+
+      simpel example rigs/cart
     """
     from simpel_cli.reporting.example import example as task
 

@@ -7,11 +7,13 @@ import typer
 
 
 def export(
-    run_dir: Annotated[Path, typer.Argument(help="Directory of a fit, a discovery or an offline policy.")],
-    out: Annotated[Path | None, typer.Option(help="Folder of the files; left out: export/ in the run's own.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of several that the run has fitted.")] = None,
+    run_dir: Annotated[Path, typer.Argument(help="Directory of a run of fit, discover or rl-offline.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the files. Default: export/ in the run directory.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed to export, of a run with several. Default: the first.")] = None,
 ) -> None:
-    """Write the simulator for CasADi and C, and the networks for numpy.
+    """Write the files that a rig needs: the simulator for CasADi and C, the networks for numpy.
 
     Examples:
       simpel export runs/discover/hidden_pendulum/20261121-101502-3fa9

@@ -1,7 +1,7 @@
 """`simpel fit`: a posterior from measured transitions, with a simulator as prior."""
 
-from simpel_cli.commands.launching import launch, refuse_more
 from simpel_cli.commands.options import Cfg, ConfigDir, Multirun, Overrides, Resume
+from simpel_cli.commands.starting import launch, refuse_more
 
 
 def fit(
@@ -11,7 +11,7 @@ def fit(
     multirun: Multirun = False,
     resume: Resume = None,
 ) -> None:
-    """Fit a model to measured transitions, with a simulator as prior.
+    """Fit a model to measurements, with a simulator as prior, and test it on held-out episodes.
 
     Examples:
       simpel fit experiment=pendulum

@@ -32,15 +32,19 @@ def _one_of(value: str | None) -> str | None:
 
 Overrides = Annotated[
     list[str] | None,
-    typer.Argument(metavar="KEY=VALUE...", help="Groups and keys, as Hydra overrides.", autocompletion=_overrides),
+    typer.Argument(
+        metavar="KEY=VALUE...",
+        help="Groups (sim=NAME) and keys (data.n_train=20) of the configuration, as Hydra overrides.",
+        autocompletion=_overrides,
+    ),
 ]
 ConfigDir = Annotated[
     Path | None,
-    typer.Option("--config-dir", "-cd", help="Folder with groups of your own: sim/, data/, experiment/, ..."),
+    typer.Option("--config-dir", "-cd", help="Folder with YAML files of your own, in sim/, data/, experiment/, ..."),
 ]
 Cfg = Annotated[
     str | None,
-    typer.Option("--cfg", callback=_one_of, help="Print the composed configuration (`--cfg job`) and do nothing."),
+    typer.Option("--cfg", callback=_one_of, help="Print the configuration (`--cfg job`) and do nothing else."),
 ]
 Multirun = Annotated[bool, typer.Option("--multirun", "-m", help="Run every combination of comma-separated values.")]
 Resume = Annotated[Path | None, typer.Option(help="Continue an interrupted run, named by its directory.")]

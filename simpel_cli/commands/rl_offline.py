@@ -1,7 +1,7 @@
 """`simpel rl-offline`: a policy from recorded transitions."""
 
-from simpel_cli.commands.launching import launch, refuse_more
 from simpel_cli.commands.options import Cfg, ConfigDir, Multirun, Overrides, Resume
+from simpel_cli.commands.starting import launch, refuse_more
 
 
 def rl_offline(
@@ -11,7 +11,7 @@ def rl_offline(
     multirun: Multirun = False,
     resume: Resume = None,
 ) -> None:
-    """Learn a policy in a model that was fitted to measurements, and judge it in the true world.
+    """Learn a control policy from recorded measurements, and test it in a simulator that stands for the real system.
 
     Examples:
       simpel rl-offline experiment=rc_car_parking data.n_train=200

@@ -1,7 +1,7 @@
 """`simpel rl-online`: a policy from episodes of its own."""
 
-from simpel_cli.commands.launching import launch, refuse_more
 from simpel_cli.commands.options import Cfg, ConfigDir, Multirun, Overrides, Resume
+from simpel_cli.commands.starting import launch, refuse_more
 
 
 def rl_online(
@@ -11,7 +11,7 @@ def rl_online(
     multirun: Multirun = False,
     resume: Resume = None,
 ) -> None:
-    """Act, measure, learn a model and a policy, act again, without data to begin with.
+    """Learn a control policy from nothing: act in the real system, measure, learn a model and a policy, act again.
 
     Examples:
       simpel rl-online experiment=rc_car_parking online.episodes=10

@@ -1,11 +1,11 @@
 """`simpel simulate`: measurements made by a simulator."""
 
-from simpel_cli.commands.launching import launch
 from simpel_cli.commands.options import Cfg, ConfigDir, Overrides
+from simpel_cli.commands.starting import launch
 
 
 def simulate(overrides: Overrides = None, config_dir: ConfigDir = None, cfg: Cfg = None) -> None:
-    """Turn a simulator or a MuJoCo world into measurements: Parquet and card.
+    """Make measurements with a simulator or a MuJoCo world: a Parquet file, and a card that says how it was made.
 
     Examples:
       simpel simulate sim=pendulum_world out=data/pendulum

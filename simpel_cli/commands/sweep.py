@@ -5,17 +5,19 @@ from typing import Annotated
 
 import typer
 
-from simpel_cli.commands.launching import refuse_more
 from simpel_cli.commands.options import Cfg, ConfigDir, Overrides
+from simpel_cli.commands.starting import refuse_more
 
 
 def sweep(
     overrides: Overrides = None,
     config_dir: ConfigDir = None,
     cfg: Cfg = None,
-    resume: Annotated[Path | None, typer.Option(help="Run what is missing or failed of a sweep.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Continue a sweep: run the jobs that are missing or failed.")
+    ] = None,
 ) -> None:
-    """Fit every combination of values and collect the results; other verbs sweep with -m.
+    """Fit every combination of values on all cores or a cluster, and collect the results. Other verbs sweep with -m.
 
     Examples:
       simpel sweep experiment=pendulum method=simpel,fsvgd data.n_train=10,20,40 'run.seed=range(3)'

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.config.places import conf_dir
+from simpel_cli.config.folders import conf_dir
 from simpel_cli.errors import ConfigError
 
 CONTROL = ("rl-offline", "rl-online")

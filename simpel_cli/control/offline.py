@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import of_run
 from simpel_cli.control.agents.rollout import Episodes
 from simpel_cli.control.assignment import Assignment, assignment, refuse_outputs, remarks

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli import evaluation as ev
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.control.assignment import assignment, remarks
 from simpel_cli.control.online_settings import MEASURED, Online

@@ -1,9 +1,9 @@
 """Measurements: read, checked, cut into episodes, brought to the simulator's dt and split."""
 
 from simpel_cli.data.config import Measurements
+from simpel_cli.data.origins import Places, origins, places
 from simpel_cli.data.reader import read
 from simpel_cli.data.recording import Check, Episode, Recording, Transitions, no_transitions, select, transitions
-from simpel_cli.data.segments import Places, origins, places
 from simpel_cli.data.tables.locate import absolute
 
 __all__ = [

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simpel_cli.data.checks import clock, gaps, sensors, values
+from simpel_cli.data.checks import clock, sensors, values
 from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.data.checks.units import check_units, period
 from simpel_cli.data.computed import with_computed
@@ -18,6 +18,7 @@ from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
 from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.tables.locate import by_file, locate
 from simpel_cli.data.tables.table import read_table
+from simpel_cli.data.time_gaps import cut_at_gaps
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
 
@@ -86,7 +87,7 @@ def _trajectories(
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
     """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
     sampling, raw = clock.sampling(rows, model, config)
-    cut, starts = gaps.gaps(rows, raw, config)
+    cut, starts = cut_at_gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
     faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
     report = [sampling, cut, *faults]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.data import Recording
 from simpel_cli.discovery.likelihood.fit import Fitter
@@ -19,13 +19,13 @@ from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
-from simpel_cli.discovery.search.gate import Gate
-from simpel_cli.discovery.search.remainder.disturbances import Disturbance, time_dependent_disturbance
-from simpel_cli.discovery.search.remainder.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import setup, terms_of
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
+from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.corrected import corrected
 from simpel_cli.discovery.verdict.evidence import evidence_tables
 from simpel_cli.discovery.verdict.remainder import remainder_of

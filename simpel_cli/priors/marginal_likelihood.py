@@ -48,7 +48,7 @@ class Spectrum(NamedTuple):
     padding: Float[Array, ""]
 
 
-class Likeliest(NamedTuple):
+class MarginalLikelihoodFit(NamedTuple):
     """Per output, normalised: kappa, sigma, and minus the logarithm of the penalised marginal likelihood."""
 
     scale: Float[Array, " dy"]
@@ -77,7 +77,7 @@ def best_scales(
     prior_std: float | None,
     floor: Float[Numbers, " dy"],
     typical: Float[Numbers, " dy"],
-) -> Likeliest:
+) -> MarginalLikelihoodFit:
     """Return what maximises the penalised marginal likelihood of every output.
 
     Args:
@@ -116,7 +116,9 @@ def best_scales(
         i, j = jnp.unravel_index(jnp.argmin(losses), losses.shape)
         return scales[i], levels[j], losses[i, j]
 
-    return Likeliest(*jax.vmap(of_output, in_axes=(1, 0, 0, 0, 0))(given.turned, scales, penalty, floor, typical))
+    return MarginalLikelihoodFit(
+        *jax.vmap(of_output, in_axes=(1, 0, 0, 0, 0))(given.turned, scales, penalty, floor, typical)
+    )
 
 
 def noise_of_smooth(

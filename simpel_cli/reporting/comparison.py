@@ -14,7 +14,7 @@ from simpel_cli.reporting.figures.canvas import distinct, with_interval
 from simpel_cli.reporting.figures.compare import Course, draw_calibrations, draw_courses
 from simpel_cli.reporting.figures.sweep import draw_by_size
 from simpel_cli.reporting.html import figure
-from simpel_cli.reporting.tables import write_csv, write_latex
+from simpel_cli.reporting.table_files import write_csv, write_latex
 from simpel_cli.runs.files import read_columns
 from simpel_cli.runs.finding import Found
 

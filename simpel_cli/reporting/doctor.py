@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.config.places import conf_dir, recordings_dir
+from simpel_cli.config.folders import conf_dir, recordings_dir
 from simpel_cli.config.resolved import load
 from simpel_cli.errors import SimpelError
 from simpel_cli.runs.console import Terminal, aligned

@@ -10,7 +10,7 @@ from simpel_cli.errors import SimpelError
 from simpel_cli.runs.manifest import read_manifest
 
 MARKS = ("manifest.json", "metrics.parquet", ".hydra")  # a directory with one of them is that of a run
-ASIDE = ".failed-"  # in the name of what a failed job has left, see `commands.job`
+ASIDE = ".failed-"  # in the name of what a failed job has left, see `sweeps.job`
 
 
 class Found(NamedTuple):

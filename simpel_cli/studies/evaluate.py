@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import of_run
 from simpel_cli.data import Check
 from simpel_cli.data.summary import held_out_summary

@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.inference import loop

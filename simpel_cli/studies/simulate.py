@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.console import Terminal

@@ -7,7 +7,7 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import of_run
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.runs.console import silence

@@ -1,6 +1,6 @@
 """`simpel sweep`, and `-m` of every verb: run every combination of values, collect what is complete.
 
-Hydra composes the jobs. Its launcher `dask` hands them to workers of `commands.cluster`; any other launcher of Hydra runs
+Hydra composes the jobs. Its launcher `dask` hands them to workers of `sweeps.workers`; any other launcher of Hydra runs
 each where it likes, and finds the same `perform`. A job that fails, or a worker that dies, costs that job only.
 """
 
@@ -11,8 +11,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from simpel_cli.config.launch import Job, launch, sweep_directory
-from simpel_cli.config.launcher import DaskLauncher
+from simpel_cli.config.compose import Job, launch, sweep_directory
+from simpel_cli.config.hydra_launcher import DaskLauncher
 from simpel_cli.config.overrides import count_jobs, first_job, value_of
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.runs.console import Board, Terminal
@@ -73,7 +73,7 @@ class Sweep:
         self._open.close()
 
     def _start(self, job: Job) -> None:
-        from simpel_cli.sweeps.cluster import Cluster, Options
+        from simpel_cli.sweeps.workers import Cluster, Options
 
         options = Options.of(job.launcher)
         assert job.sweep is not None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 
 
 def fit(job: Job) -> None:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.config.launch import Job, launch
+from simpel_cli.config.compose import Job, launch
 from simpel_cli.data import transitions
 from simpel_cli.evaluation import test_arrays
 from simpel_cli.inference import loop

@@ -54,7 +54,7 @@ def test_fit_with_a_method_of_its_own(my: Path) -> None:
 
 
 def test_launcher_of_its_own(my: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simpel_cli.sweeps.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("simpel_cli.sweeps.workers.PATIENCE", 0.5)
     words = ("sweep", "--config-dir", ".", "experiment=cart", "run.seed=0,1", "hydra/launcher=cluster")
     result = simpel(my, *words, "hydra.launcher.address=tcp://127.0.0.1:9")
     assert (result.code, "no scheduler answers at tcp://127.0.0.1:9" in result.err) == (2, True)

@@ -10,9 +10,9 @@ import yaml
 from command_line import ROOT, simpel
 from omegaconf import OmegaConf
 
+from simpel_cli.config.folders import conf_dir
 from simpel_cli.config.nodes import build
 from simpel_cli.config.overrides import checked, count_jobs
-from simpel_cli.config.places import conf_dir
 from simpel_cli.data import Measurements
 from simpel_cli.evaluation.settings import Evaluation
 from simpel_cli.runs.settings import Settings

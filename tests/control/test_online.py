@@ -534,7 +534,7 @@ def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> No
 
 
 def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
-    """As docs/control.md has it: no data, a simulator and a task; then what became of the run is not overwritten."""
+    """As docs/how-to/control.md has it: no data, a simulator and a task; then what became of the run is not overwritten."""
     text = (ROOT / "conf" / "sim" / "pendulum.yaml").read_text().replace("phi", "angle").replace("omega", "speed")
     node = yaml.safe_load(text)
     lift = {

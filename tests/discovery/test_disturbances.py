@@ -13,16 +13,16 @@ from test_interactions import FRICTION, NOISE, ROWS
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.search.errors_ahead import Assessor
-from simpel_cli.discovery.search.remainder.disturbances import (
+from simpel_cli.discovery.search.selection import Selection, select
+from simpel_cli.discovery.search.setup import setup
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.unexplained.disturbances import (
     Disturbance,
     _evidence,
     _statistics,
     time_dependent_disturbance,
 )
-from simpel_cli.discovery.search.remainder.noise_profile import Level, NoiseProfile, evidence
-from simpel_cli.discovery.search.selection import Selection, select
-from simpel_cli.discovery.search.setup import setup
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.discovery.verdict.remainder import dependence, remainder_of
 from simulators.model import Declared, Model
 

@@ -10,7 +10,7 @@ from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.setup import test_windows as held_out
 from simpel_cli.discovery.search.trials import Search, Stage, Trial
-from simpel_cli.discovery.verdict.evidence import Exhibit, evidence_tables
+from simpel_cli.discovery.verdict.evidence import EvidenceTable, evidence_tables
 from simulators.effects import Expression
 
 DRAG = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": {"range": [0, 1], "unit": "1/V"}})
@@ -18,7 +18,7 @@ PLANTED, C = 0.5, 0.2
 
 
 @pytest.fixture(scope="module")
-def shown() -> dict[str, Exhibit]:
+def shown() -> dict[str, EvidenceTable]:
     """Tables of a search that would have chosen the planted load, and a drag that is not there."""
     measured = recording(3, noise=0.01, load=PLANTED)
     plan = setup(model(), measured, (), [LOAD, DRAG], 2)
@@ -54,7 +54,7 @@ def shown() -> dict[str, Exhibit]:
     return evidence_tables(search, selection, assessor, measured, windows, before, after)
 
 
-def test_the_latent_force_is_the_planted_load(shown: dict[str, Exhibit]) -> None:
+def test_the_latent_force_is_the_planted_load(shown: dict[str, EvidenceTable]) -> None:
     table, units = shown["residuals"]
     assert set(table["model"]) == {"before", "without", "after"}
     assert set(table["split"]) == {"train", "test"}
@@ -67,7 +67,7 @@ def test_the_latent_force_is_the_planted_load(shown: dict[str, Exhibit]) -> None
     assert 0 < np.median(table["std"][own]) < 0.3
 
 
-def test_effects_are_what_the_flow_makes_of_them(shown: dict[str, Exhibit]) -> None:
+def test_effects_are_what_the_flow_makes_of_them(shown: dict[str, EvidenceTable]) -> None:
     """Over a row the velocity decays a little: the mean force is the sum of the terms times (1 - exp(-A dt))/(A dt)."""
     table, _ = shown["residuals"]
     own = (table["model"] == "without") & (np.abs(table["v"]) < 0.3)
@@ -75,14 +75,14 @@ def test_effects_are_what_the_flow_makes_of_them(shown: dict[str, Exhibit]) -> N
     np.testing.assert_allclose(table["effect"][own], PLANTED * damped, atol=0.07)
 
 
-def test_a_curve_is_its_expression(shown: dict[str, Exhibit]) -> None:
+def test_a_curve_is_its_expression(shown: dict[str, EvidenceTable]) -> None:
     """The drag has an argument; the load has none, hence no curve."""
     curve, _ = shown["effect_curves"]
     assert set(zip(curve["effect"], curve["argument"], curve["acts_on"], strict=True)) == {("drag", "v", "v")}
     np.testing.assert_allclose(curve["force"], -C * curve["value"] * np.abs(curve["value"]), atol=1e-12)
 
 
-def test_steps_parameters_and_coverage(shown: dict[str, Exhibit]) -> None:
+def test_steps_parameters_and_coverage(shown: dict[str, EvidenceTable]) -> None:
     steps, _ = shown["candidates"]
     assert steps["step"].tolist() == [1, 1, 2]
     assert steps["accepted"].tolist() == [True, False, True]
@@ -98,7 +98,7 @@ def test_steps_parameters_and_coverage(shown: dict[str, Exhibit]) -> None:
     assert (coverage["low"] < coverage["high"]).all()
 
 
-def test_errors_fall_and_free_runs_are_named(shown: dict[str, Exhibit]) -> None:
+def test_errors_fall_and_free_runs_are_named(shown: dict[str, EvidenceTable]) -> None:
     runs, _ = shown["trajectories"]
     assert set(runs["episode"]) == {"4"}
     errors, _ = shown["errors"]

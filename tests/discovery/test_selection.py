@@ -18,7 +18,7 @@ from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.errors_ahead import Assessor
-from simpel_cli.discovery.search.gate import Gate
+from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.selection import cut, further, select
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked

@@ -15,7 +15,7 @@ import pytest
 from command_line import FIT, TINY, rig, simpel
 
 from simpel_cli.config import nodes
-from simpel_cli.config.places import conf_dir
+from simpel_cli.config.folders import conf_dir
 from simpel_cli.config.resolved import load
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.runs.manifest import FORMAT

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from command_line import CART, rig, simpel
 
-from simpel_cli.config.places import conf_dir
+from simpel_cli.config.folders import conf_dir
 from simpel_cli.reporting import doctor
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.stats
 
-from simpel_cli.config.launch import launch
+from simpel_cli.config.compose import launch
 from simpel_cli.errors import SimpelError
 from simpel_cli.reporting.figures.canvas import legend_below, line_style, new_figure, ratio_scale, save
 from simpel_cli.runs.files import write_table, write_text

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.config.launch import launch
+from simpel_cli.config.compose import launch
 from simpel_cli.runs.files import write_text
 from simpel_cli.studies.simulate import simulate
 from tests.reproduce.panel import (

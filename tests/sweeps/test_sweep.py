@@ -16,7 +16,7 @@ from command_line import FIT, PATIENCE, TINY, environment, rows, simpel, start
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.lock import is_locked, locked
-from simpel_cli.sweeps.cluster import Options
+from simpel_cli.sweeps.workers import Options
 
 # long enough to be killed amid it; the same job several times, so that each says what the others should have come to
 LONG = ("experiment=pendulum", *TINY, "method.steps=3000", "run.quiet=false")
@@ -224,7 +224,7 @@ def test_wrong_options(given: dict[str, object], message: str) -> None:
 
 
 def test_nobody_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simpel_cli.sweeps.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("simpel_cli.sweeps.workers.PATIENCE", 0.5)
     words = ("experiment=pendulum", *TINY, "run.seed=0,1", "hydra.sweep.dir=sweep")
     result = simpel(tmp_path, "sweep", *words, "hydra.launcher.address=tcp://127.0.0.1:9")
     assert result.code == 2

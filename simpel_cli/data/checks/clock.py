@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from simpel_cli.data.checks.gaps import _bridge
 from simpel_cli.data.checks.sensors import IRREGULAR_SHARE, irregular_share
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Check, Source
 from simpel_cli.data.rows import Rows, follows, same_episode
 from simpel_cli.data.tables.table import Table
+from simpel_cli.data.time_gaps import _bridge
 from simpel_cli.errors import ConfigError, DataError
 
 DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter

@@ -270,19 +270,19 @@ def _evaluate(
     de, ds = (jnp.where(ok[None], a, 0.0) for a in (de, ds))
     weight = course.weight.reshape(-1)
 
-    def per_lane(a: Array) -> Array:
+    def per_hypothesis(a: Array) -> Array:
         """(..., T, ny, L W) -> (L, ..., T ny W)."""
         lead = a.shape[:-3]
         apart = a.reshape(*lead, -1, count, windows)
         return jnp.moveaxis(apart, -2, 0).reshape(count, *lead, -1)
 
-    loss = jnp.sum(per_lane(jnp.where(ok, 0.5 * weight[None, None] * (jnp.log(s) + e * e / s), 0.0)), axis=1)
-    first = per_lane(weight[None, None] * (e / s))
-    second = per_lane(0.5 * weight[None, None] * (1 / s - (e / s) ** 2))
-    slopes, spreads = per_lane(de), per_lane(ds)
+    loss = jnp.sum(per_hypothesis(jnp.where(ok, 0.5 * weight[None, None] * (jnp.log(s) + e * e / s), 0.0)), axis=1)
+    first = per_hypothesis(weight[None, None] * (e / s))
+    second = per_hypothesis(0.5 * weight[None, None] * (1 / s - (e / s) ** 2))
+    slopes, spreads = per_hypothesis(de), per_hypothesis(ds)
     gradient = jnp.einsum("ldk,lk->ld", slopes, first) + jnp.einsum("ldk,lk->ld", spreads, second)
-    root = per_lane(jnp.sqrt(weight[None, None] / s))[:, None]
-    scaled = jnp.concatenate([slopes * root, spreads * root * per_lane(jnp.sqrt(0.5 / s))[:, None]], axis=2)
+    root = per_hypothesis(jnp.sqrt(weight[None, None] / s))[:, None]
+    scaled = jnp.concatenate([slopes * root, spreads * root * per_hypothesis(jnp.sqrt(0.5 / s))[:, None]], axis=2)
     fisher = jnp.einsum("ldk,lek->lde", scaled, scaled)
 
     sd = coordinates.sd_of_prior()[course.index]

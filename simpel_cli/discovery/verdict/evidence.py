@@ -38,7 +38,7 @@ BEFORE, WITHOUT, AFTER = "before", "without", "after"
 GRID = 101  # points of an effect's curve
 
 
-class Exhibit(NamedTuple):
+class EvidenceTable(NamedTuple):
     """A table: columns, and the units of those that no other column gives."""
 
     columns: Columns
@@ -53,7 +53,7 @@ def evidence_tables(
     windows: Windows,
     before: Assessment,
     after: Assessment,
-) -> dict[str, Exhibit]:
+) -> dict[str, EvidenceTable]:
     """Return the tables of a search by the names of their files.
 
     Args:
@@ -106,16 +106,16 @@ def evidence_tables(
     names = dict(zip([*arguments[0], *arguments[1]], [*model.states, *model.inputs], strict=True))
     span = {q.name: residual[column] for column, q in names.items()}
     return {
-        "residuals": Exhibit(residual, {"time": "s"} | {column: q.unit for column, q in names.items()}),
-        "effect_curves": Exhibit(_curves(search, selection, span), {}),
-        "innovations": Exhibit(joined(innovations), {"time": "s"}),
-        "trajectories": Exhibit(
+        "residuals": EvidenceTable(residual, {"time": "s"} | {column: q.unit for column, q in names.items()}),
+        "effect_curves": EvidenceTable(_curves(search, selection, span), {}),
+        "innovations": EvidenceTable(joined(innovations), {"time": "s"}),
+        "trajectories": EvidenceTable(
             trajectory_columns(before, after, windows, recording.test, measured), {"time": "s"}
         ),
-        "errors": Exhibit(error_columns(before, after, windows, measured, noise), {}),
-        "parameters": Exhibit(parameter_columns(search, selection), {}),
-        "candidates": Exhibit(candidate_columns(search, selection), {"log_evidence_gain": "nat", "asked": "nat"}),
-        "coverage": Exhibit(_coverage(search, recording), {}),
+        "errors": EvidenceTable(error_columns(before, after, windows, measured, noise), {}),
+        "parameters": EvidenceTable(parameter_columns(search, selection), {}),
+        "candidates": EvidenceTable(candidate_columns(search, selection), {"log_evidence_gain": "nat", "asked": "nat"}),
+        "coverage": EvidenceTable(_coverage(search, recording), {}),
     }  # fmt: skip
 
 

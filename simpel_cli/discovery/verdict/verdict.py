@@ -7,7 +7,7 @@ import numpy as np
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
-from simpel_cli.discovery.search.gate import Gate
+from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.search.trials import Search, Trial, asked

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from simpel_cli.errors import ConfigError
 
 if TYPE_CHECKING:
-    from simpel_cli.config.launch import Job
+    from simpel_cli.config.compose import Job
 
 
 def launch(
@@ -33,7 +33,7 @@ def launch(
 
         sweep(verb, overrides or [], config_dir, cfg)
         return
-    from simpel_cli.config.launch import launch as compose
+    from simpel_cli.config.compose import launch as compose
 
     compose(verb, task, overrides or [], config_dir=config_dir, flags=["--cfg", cfg] if cfg else [])
 

@@ -23,13 +23,13 @@ import dask
 import dask.utils
 from distributed import Client, LocalCluster, WorkerPlugin
 
-from simpel_cli.config.launch import Job
+from simpel_cli.config.compose import Job
 from simpel_cli.errors import ConfigError, did_you_mean
 from simpel_cli.sweeps.job import Outcome, perform
+from simpel_cli.sweeps.retry import SCHEDULER, outcome_of
 
 MEMORY_EACH = 2.5e9  # bytes of a job, about
 PATIENCE = 15.0  # s for a scheduler to answer, and for a worker of its to appear
-RETRIES = 1  # of a job whose worker died
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,7 @@ class Cluster:
         self._running: dict[str, tuple[Job, Any]] = {}  # key -> job and future
         self._close = contextlib.ExitStack()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said by outcomes
-        settings = {
-            "distributed.scheduler.allowed-failures": RETRIES,
+        settings = SCHEDULER | {
             "distributed.nanny.pre-spawn-environ": {},  # as many threads as `simpel fit` has: the same numbers
             "distributed.admin.tick.limit": "60s",
             "distributed.comm.timeouts.connect": f"{PATIENCE}s",
@@ -152,7 +151,7 @@ class Cluster:
         with contextlib.suppress(queue.Empty):
             key = self._ended.get(timeout=seconds) if seconds else self._ended.get_nowait()
             while True:
-                yield _outcome(*self._running.pop(key))
+                yield outcome_of(*self._running.pop(key))
                 self._feed()
                 key = self._ended.get_nowait()
         self._feed()  # there may be more workers than before
@@ -238,18 +237,6 @@ class _Deaf(WorkerPlugin):
         import signal
 
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _outcome(job: Job, future: Any) -> Outcome:
-    """Return how a job ended whose future is done."""
-    error = future.exception()
-    if error is None:
-        return future.result()
-    if type(error).__name__ == "KilledWorker":
-        text = f"its worker died {RETRIES + 1} times (out of memory, or killed)"
-    else:
-        text = f"{type(error).__name__}: {error}"
-    return Outcome(job.directory, 1, text, job.words)
 
 
 _stops: dict[str, threading.Event] = {}  # of this worker, by sweep

@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from simpel_cli.config.folders import conf_dir, example_data_dir, recordings_dir, require_recordings
 from simpel_cli.config.groups import BROUGHT, CONTROL, group_folder, keys_of_other_verbs, top_level, user_conf
 from simpel_cli.config.hydra_errors import translated, unknown_root
 from simpel_cli.config.overrides import checked, swept_keys, value_of
-from simpel_cli.config.places import conf_dir, example_data_dir, recordings_dir, require_recordings
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import refuse_occupied
 
@@ -56,7 +56,7 @@ def launch(
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    from simpel_cli.config import launcher
+    from simpel_cli.config import hydra_launcher as launcher
 
     words = checked(_appended(verb, overrides))
     user = user_conf(config_dir)
@@ -134,7 +134,7 @@ def _mode_of_flags() -> Iterator[None]:
 
 def sweep_directory() -> Path | None:
     """Return the directory of the multirun that this process has started last."""
-    from simpel_cli.config import launcher
+    from simpel_cli.config import hydra_launcher as launcher
 
     return launcher.directories[-1] if launcher.directories else None
 

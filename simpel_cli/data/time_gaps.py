@@ -1,4 +1,4 @@
-"""Gaps in the time stamps: an episode is cut there."""
+"""Gaps in the time stamps of a recording: an episode is cut there."""
 
 import math
 
@@ -11,8 +11,8 @@ from simpel_cli.data.rows import Rows, follows
 MANY_GAPS = 0.01  # of the steps; more are a clock that is irregular
 
 
-def gaps(rows: Rows, dt: float, config: Measurements) -> tuple[Check, np.ndarray]:
-    """Find where a segment of contiguous rows starts.
+def cut_at_gaps(rows: Rows, dt: float, config: Measurements) -> tuple[Check, np.ndarray]:
+    """Cut episodes where time is missing: find where a segment of contiguous rows starts.
 
     Args:
         rows: checked for NaN.

@@ -17,7 +17,7 @@ class DaskLauncher(BasicLauncher):
     """Hands every job to the task function as soon as it is composed. The task function queues it and returns.
 
     Args:
-        options: of the cluster, see `conf/hydra/launcher/dask.yaml`; jobs carry them to `commands.cluster`.
+        options: of the cluster, see `conf/hydra/launcher/dask.yaml`; jobs carry them to `sweeps.workers`.
     """
 
     chosen: ClassVar[bool] = False  # by the multirun of this process: options of a user's own may have any name

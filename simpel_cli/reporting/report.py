@@ -16,7 +16,7 @@ from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
 from simpel_cli.reporting.comparison import Comparison, Run
 from simpel_cli.reporting.figures.canvas import distinct
 from simpel_cli.reporting.html import write_report
-from simpel_cli.reporting.tables import write_csv, write_latex
+from simpel_cli.reporting.table_files import write_csv, write_latex
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, typed
 from simpel_cli.runs.finding import Found, runs_below
