@@ -36,9 +36,16 @@ PLAIN_KEYS = ("choices", "run_dir", "out", "close", "report", "world")  # of a c
 
 
 def obvious_class(path: str) -> type | None:
-    """Return the class of a node without `_target_`, by its place, e.g. `sim` or `effect.stiction`; None: there is none."""
-    name = CLASSES.get(path.partition(".")[0])
-    if name is None or path.count(".") > path.startswith("effect."):
+    """Return the class of a node without `_target_`, by its place; None: there is none.
+
+    Args:
+        path: of a group (`sim`), of an entry of `effect` (`effect.stiction`), or of a simulator's base (`sim.base`).
+    """
+    group, *below = path.split(".")
+    entry = group == "effect" and len(below) == 1
+    base = group in SIMULATORS and set(below) == {"base"}
+    name = CLASSES.get(group) if not below or entry or base else None
+    if name is None:
         return None
     module, _, attribute = name.rpartition(".")
     found: type = getattr(importlib.import_module(module), attribute)

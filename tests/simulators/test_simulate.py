@@ -54,7 +54,6 @@ def static() -> Model:
 
 def world_of(file: str) -> Any:
     node = yaml.safe_load((CONF / file).read_text())
-    del node["_target_"]
     return MujocoWorld(**node).model()
 
 
@@ -205,7 +204,6 @@ def test_a_world_is_simulated_and_its_gap_stands_out_of_the_noise() -> None:
     columns, card = Simulate(episodes=6, steps=40, noise_std=std, truth=truth).run(world_of("pendulum_world.yaml"))
     assert card["truth"] == truth
     node = yaml.safe_load((CONF / "pendulum.yaml").read_text())
-    del node["_target_"]
     gravity_only = RK4(Declared(**node).model())
     states = np.column_stack([columns["phi"], columns["omega"]])
     predicted = gravity_only.step(states, columns["u"][:, None], np.tile([1.0, 1.0, 1.0], (240, 1)))
