@@ -54,6 +54,7 @@ def static() -> Model:
 
 def world_of(file: str) -> Any:
     node = yaml.safe_load((CONF / file).read_text())
+    del node["_target_"]
     return MujocoWorld(**node).model()
 
 
