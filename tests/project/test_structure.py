@@ -1,6 +1,7 @@
 """The structure that a newcomer relies on: rooms that say what is in them, short files, imports without circles."""
 
 import ast
+import re
 from pathlib import Path
 
 import grimp
@@ -52,3 +53,30 @@ def test_tests_stand_in_the_rooms_of_the_code() -> None:
     others = {"project"}  # what is shipped, and the whole
     for path in (ROOT / "tests").rglob("test_*.py"):
         assert path.parent.name in rooms | others, path
+
+
+GUIDES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "explanation").glob("life_of_*.md"))]
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.name)
+def test_a_guide_names_files_and_functions_that_exist(guide: Path) -> None:
+    named = re.findall(r"`([\w/]+(?:\.py|/))(?:: ([\w.]+))?`", guide.read_text())
+    assert named
+    for file, name in (each for each in named if not each[0].endswith("/x.py")):
+        path = next((root / file for root in (PACKAGE, ROOT) if (root / file).exists()), None)
+        assert path is not None or "/" not in file, f"{file} is missing"
+        if path is not None and name:
+            text = path.read_text()
+            for part in name.split("."):
+                assert re.search(rf"^\s*(?:def|class) {part}\b", text, re.M), f"{file} has no {part}"
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    """Those of README and CONTRIBUTING; `make docs` checks those of the site."""
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md"):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_readme_is_short() -> None:
+    assert lines(ROOT / "README.md") <= 200
