@@ -29,7 +29,7 @@ class Assignment(NamedTuple):
         policy: how it learns.
         planner: in its place, plans in the model at every step; None: a policy is learned.
         source: the simulator.
-        truth: the true world; None: there is none to judge in.
+        truth: the true simulator; None: there is none to test in.
         truth_name: its name.
     """
 
@@ -61,7 +61,7 @@ def assignment(declared: Declared) -> Assignment:
         raise ConfigError("reward: missing; name a task, e.g. reward=parking, or an experiment that brings one.")
     control, source = groups.get("control") or Control(), declared.source
     if not source.states:
-        raise ConfigError(f"sim: {source.name} has no states, so that there is nothing to control.")
+        raise ConfigError(f"sim: {source.name} has no states, so there is nothing to control.")
     encoding = encoding_of(source, stack=declared.measurements.stack_actions)
     goal = task.bind(encoding)
     true, truth, name = groups.get("truth"), None, ""
@@ -71,23 +71,21 @@ def assignment(declared: Declared) -> Assignment:
 
 
 def remarks(asked: Assignment) -> list[str]:
-    """Return what is odd about a task, a line each."""
+    """Return warnings about a task, one line each."""
     found = []
     for q in asked.source.states:
         low, high = asked.task.begins(q.name)
         if not q.periodic and (low < q.low - 0.1 * (q.high - q.low) or high > q.high + 0.1 * (q.high - q.low)):
             found.append(
-                f"reward.initial.{q.name}: {asked.task.initial.get(q.name, 0.0)} reaches beyond its range "
-                f"[{q.low:g}, {q.high:g}] {q.unit} (sim.states.{q.name}): the model knows nothing there"
+                f"reward.initial.{q.name}: {asked.task.initial.get(q.name, 0.0)} extends beyond its range "
+                f"[{q.low:g}, {q.high:g}] {q.unit} (sim.states.{q.name}): the model is not valid there"
             )
     return found
 
 
 def _true_world(source: Any, task: Task, goal: Goal, own: Encoding, dt: float) -> World:
     if not isinstance(source, Model):
-        raise ConfigError(
-            f"truth: {source.name} answers queries only; name a simulator with equations, e.g. sim@truth=..."
-        )
+        raise ConfigError(f"truth: {source.name} is a black box; name a simulator with equations, e.g. sim@truth=...")
     encoding = encoding_of(source, stack=own.stack)
     check_compatible("truth", source, own, goal, dt)
     phi = jnp.asarray([q.middle for q in source.params], jnp.float32)
@@ -104,5 +102,5 @@ def refuse_outputs(encoding: Encoding) -> None:
     if encoding.outputs:
         measured = ", ".join(q.name for q in encoding.outputs)
         raise ConfigError(
-            f"data.columns: {measured} is measured beside the states; a policy sees states. Leave it out."
+            f"data.columns: {measured} is measured besides the states, but a policy uses states only. Leave it out."
         )

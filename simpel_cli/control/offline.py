@@ -1,4 +1,4 @@
-"""A policy learned in the posterior of a fit, and judged in the true world: the work of `simpel rl-offline`."""
+"""A policy learned in the posterior of a fit, and tested in the true simulator: the work of `simpel rl-offline`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +28,7 @@ from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import open_study
 from simpel_cli.studies.screen import Screen
 
-# terminal, configuration, posterior, assignment, policies, episodes in the true world or None, directory
+# terminal, configuration, posterior, assignment, policies, episodes in the true simulator or None, directory
 Publish = Callable[[Terminal, dict[str, Any], Learned, Assignment, TrainedPolicies, Episodes | None, Path], None]
 
 
@@ -64,7 +64,7 @@ def _run(
     declared: Declared, directory: Path, data_folder: Path, manifest: Manifest, screen: Screen, publish: Publish
 ) -> None:
     configure(declared.settings)
-    asked = assignment(declared)  # what is wrong with the task is said before the fit
+    asked = assignment(declared)  # errors of the task are reported before the fit
     study = open_study(declared.without(*CONTROL_GROUPS), data_folder)
     refuse_outputs(study.system.encoding)
     with interruption() as interrupted:
@@ -76,7 +76,7 @@ def _run(
     terminal.line()
     terminal.line(_task_line(asked), "task")
     for remark in remarks(asked):
-        terminal.line(remark, "look", style="yellow")
+        terminal.line(remark, "warning", style="yellow")
     constants = study.constants | {
         "run": directory.name, "command": "rl-offline", "n_train": model.fitted.n_train
     }  # fmt: skip
@@ -103,9 +103,9 @@ def _run(
 
 def _task_line(asked: Assignment) -> str:
     where = (
-        f"judged in the simulator {asked.truth_name}"
+        f"tested in the simulator {asked.truth_name}"
         if asked.truth is not None
-        else "no true world to judge in (truth: a simulator)"
+        else "not tested in a true simulator (sim@truth=NAME names one)"
     )
     return f"{asked.task.horizon} steps   {_learner(asked)}, sampling {asked.control.sampling}   {where}"
 
@@ -117,14 +117,14 @@ def _learner(asked: Assignment) -> str:
 
 
 def _in_truth(model: Learned, asked: Assignment, trained: TrainedPolicies) -> Episodes | None:
-    """Judge the policies in the true world."""
+    """Test the policies in the true simulator."""
     if asked.truth is None or trained.policies is None:
         return None
     return judge_of(asked, len(model.study.system.encoding.inputs))(trained.policies, stream(0, "judge in the truth"))
 
 
 def _write_episodes(model: Learned, asked: Assignment, found: Episodes, directory: Path) -> None:
-    """Write every transition in the true world."""
+    """Write every transition in the true simulator."""
     encoding = model.study.system.encoding
     runs, steps, number = found.reward.shape
     states = np.asarray(encoding.decode(found.encoded))[:, 1:]

@@ -61,7 +61,7 @@ def rl_online(job: Job, screen: Screen, publish: Publish) -> None:
         group, _, key = word.partition("=")[0].lstrip("+").partition(".")
         if group == "data" and key and key.partition(".")[0] not in MEASURED:
             raise ConfigError(
-                f"{word}: rl-online learns from episodes of its own; of data: it takes {', '.join(MEASURED)} only. "
+                f"{word}: rl-online learns from its own episodes; of the group data it takes {', '.join(MEASURED)} only. "
                 "To learn from measurements use rl-offline."
             )
     config = resolved(job)
@@ -111,8 +111,8 @@ def _more(overrides: Sequence[str], old: int) -> int:
         key, _, value = word.lstrip("+").partition("=")
         if key != "online.episodes" or not value.isdigit() or int(value) < old:
             raise ConfigError(
-                f"--resume: got {word}; a resumed run keeps its configuration, but for more episodes: online.episodes=N with N "
-                f"of at least {old}."
+                f"--resume: got {word}; a resumed run keeps its configuration, except for more episodes: online.episodes=N, "
+                f"N at least {old}."
             )
     return max([old, *(int(word.partition("=")[2]) for word in overrides)])
 
@@ -129,7 +129,7 @@ def _run(declared: Declared, directory: Path, manifest: Manifest, screen: Screen
     settings = declared.settings
     if settings.seeds > 1:
         raise ConfigError(
-            f"run.seeds: got {settings.seeds}; the episodes of one policy follow each other, so rl-online takes one. Run it "
+            f"run.seeds: got {settings.seeds}; rl-online takes one seed, because its episodes follow each other. Run it "
             "once per run.seed."
         )
     manifest.facts["device"] = str(configure(settings))
@@ -147,10 +147,10 @@ def _run(declared: Declared, directory: Path, manifest: Manifest, screen: Screen
             "task",
         )
         for remark in remarks(asked):
-            terminal.line(remark, "look", style="yellow")
+            terminal.line(remark, "warning", style="yellow")
         for number in range(online.episodes):
             _episode(run, plant, number, screen)
-    # the last policy knows most: in its model it earns more than the one before it (online.keep_better)
+    # the last policy is kept: in the last model its return is at least that of the one before (online.keep_better)
     shutil.copytree(run.folder(online.episodes - 1) / "policy", directory / "policy", dirs_exist_ok=True)
     write_metrics(directory / "metrics.parquet", metric_rows(run), metric_constants(run))
     publish(run)
@@ -201,8 +201,8 @@ def _episode(run: OnlineRun, plant: Plant, number: int, screen: Screen) -> None:
     )
     run.terminal.line(
         f"return {found['return']:.4g} (in the model {found['return_in_model']:.4g})"
-        + (f"   {'succeeded' if found['success'] else 'not yet'}" if run.asked.task.success else "")
-        + f"   NLL before it was learned {found['nll_before']:.3g}   "
+        + (f"   {'succeeded' if found['success'] else 'no success'}" if run.asked.task.success else "")
+        + f"   NLL before training on it {found['nll_before']:.3g}   "
         f"fit {facts['fit_seconds']:.0f} s, policy {facts['policy_seconds']:.0f} s{broken}",
         f"episode {number}",
     )
@@ -222,7 +222,7 @@ def _withdraw(run: OnlineRun, plant: Plant, number: int) -> None:
             f"{run.episode_file(number)} is missing, but the episodes after it are there "
             f"({run.episode_file(later[0]).name}, ...), whose policies were learned from it. Put it back, or begin a new run."
         )
-    run.terminal.line("its file was deleted: what was learned from it is set aside", f"episode {number}")
+    run.terminal.line("its file was deleted: the results learned from it are set aside", f"episode {number}")
     (run.folder(number) / "round.json").unlink()
     for i in range(number + 1, run.online.episodes):
         folder = run.folder(i)
@@ -254,12 +254,12 @@ def _trained(run: OnlineRun, number: int, model: Learned, folder: Path) -> Train
 
 
 def _surprise(run: OnlineRun, number: int, model: Learned) -> float:
-    """Return the negative log-likelihood per transition of an episode under the model that had not seen it yet."""
+    """Return the negative log-likelihood per transition of an episode under the model before it is trained on it."""
     study = model.study
     try:
         recording = recorded(run, [run.episode_file(number)])
         x, y = ev.test_arrays(transitions(recording.train, study.system.encoding.stack), study.system.encoding)
-    except DataError:  # too short an episode to tell
+    except DataError:  # the episode is too short
         return float("nan")
     posterior = posteriors(study, model.fitted, model.state)[0]
     return float(np.mean(ev.one_step(posterior, x, y).nll[:, -1]))

@@ -42,7 +42,7 @@ def sims(name: str | None, config_dir: Path | None, plugins: tuple[str, ...] = (
     if name is not None:
         _show_sim(terminal, _chosen("sim", name, every), plugins)
         return
-    head = ("sim=", "states [unit]", "inputs [unit]", "uncertain", "what it is")
+    head = ("sim=", "states [unit]", "inputs [unit]", "uncertain", "description")
     rows = [
         (
             e.name,
@@ -70,7 +70,7 @@ def effects(name: str | None, config_dir: Path | None) -> None:
     if name is not None:
         _show_effect(terminal, _chosen("effect", name, every))
         return
-    head = ("effect", "acts on", "formula", "what it is")
+    head = ("effect", "acts on", "formula", "description")
     rows = [
         (e.name, _words(e.node.get("acts_on")), _formula(e.node), str(e.node.get("meaning", "")))
         for e in every
@@ -79,7 +79,7 @@ def effects(name: str | None, config_dir: Path | None) -> None:
     terminal.line(aligned(head, rows))
     groups = [e.name for e in every if "name" not in e.node]
     terminal.line()
-    terminal.line(f"effect=[NAME,...] searches among these; groups of them: {', '.join(groups)}.")
+    terminal.line(f"effect=[NAME,...] limits the search to these effects; groups of effects: {', '.join(groups)}.")
     terminal.line("simpel effects NAME shows parameters and units.")
 
 
@@ -96,7 +96,7 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     late = getattr(model, "delay", {}) | {f"{k} (lag)": v for k, v in getattr(model, "lag", {}).items()}
     if late:
         delays = ", ".join(f"{k} {v} s" if isinstance(v, float) else f"{k} {v}" for k, v in late.items())
-        terminal.line(delays, "late")
+        terminal.line(delays, "delays")
     for group in ("states", "inputs", "params", "outputs"):
         quantities = getattr(model, group, ())
         if quantities:
@@ -140,11 +140,12 @@ def _show_effect(terminal: Terminal, entry: Entry) -> None:
         for k, p in (node.get("parameters") or {}).items()
     ]
     terminal.line()
-    terminal.line(aligned(("parameter", "unit", "from", "to", "absent at"), rows))
+    terminal.line(aligned(("parameter", "unit", "from", "to", "no effect at"), rows))
     terminal.line(
-        "A, V, S, X, U, Y, W, Q: largest rate, velocity, ... of what it acts on, from your data; dt: of the rows."
+        "Scales, computed from your data: A typical rate; V, S, X, U, Y largest velocity, position, state, input, measurement; "
+        "W, Q largest and typical yaw rate of a vehicle; dt time between rows."
     )
-    for key, meaning in (("same_as", "cannot be distinguished from"), ("generalises", "becomes, by its parameters")):
+    for key, meaning in (("same_as", "cannot be distinguished from"), ("generalises", "contains as a special case")):
         if node.get(key):
             terminal.line(f"{meaning}: {_words(node[key])}")
 
@@ -169,7 +170,7 @@ def _chosen(group: str, name: str, every: Sequence[Entry]) -> Entry:
             return entry if entry.node else entry._replace(node=load(entry.path))  # says what is wrong with the file
     names = [entry.name for entry in every]
     raise ConfigError(
-        f"{group}: got {name}; there is no such one.{did_you_mean(name, names)} `simpel {group}s` lists them."
+        f"{group}: got {name}; there is no {group} of that name.{did_you_mean(name, names)} `simpel {group}s` lists them."
     )
 
 
@@ -207,7 +208,7 @@ def _listed(quantities: Any) -> str:
 def _uncertain(node: Mapping[str, Any]) -> str:
     parameters = node.get("parameters")
     if not isinstance(parameters, Mapping):
-        return "-"  # built in Python: `simpel sims NAME` tells
+        return "-"  # built in Python: `simpel sims NAME` lists them
     return str(sum(isinstance(p, Mapping) and "range" in p for p in parameters.values()))
 
 

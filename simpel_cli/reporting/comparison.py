@@ -1,4 +1,4 @@
-"""What runs of one verb, experiment and data set say when they are compared: tables, figures, a sentence."""
+"""Comparison of the runs of one verb, experiment and data set: tables, figures, a sentence."""
 
 import contextlib
 import json
@@ -19,7 +19,7 @@ from simpel_cli.runs.files import read_columns
 from simpel_cli.runs.finding import Found
 
 COURSES = {  # verb -> metric, its split, what it runs along, what it is called
-    "fit": ("loss", "train", "step", "loss: NLL per point [nat]"),
+    "fit": ("loss", "train", "step", "training loss: NLL per point [nat]"),
     "rl-offline": ("return_in_model", "train", "step", "return in the model"),
     "rl-online": ("return", "test", "episode", "return"),
 }
@@ -79,15 +79,17 @@ class Comparison:
             found.append(self._best(chosen))
         drawn = draw_by_size(self.every, self.out / f"{self.slug}.png") if len(self._sizes()) > 1 else None
         if drawn is not None:
-            note = "Medians over seeds, bands from the smallest to the largest seed."
-            found.append(figure(drawn) | {"title": f"{self.name}: against data size", "note": note})
+            note = "Test metrics. Lines: medians over seeds; bands: smallest to largest seed."
+            found.append(
+                figure(drawn) | {"title": f"{self.name}: metrics by number of training transitions", "note": note}
+            )
         found += [self._means(metric) for metric in self.metrics]
         if chosen is not None:
             found += self._differences(chosen)
         return found + self._courses() + self._calibration() + self._verdicts()
 
     def leads(self) -> list[str]:
-        """Return the sentence that says it all."""
+        """Return the main result in one sentence."""
         chosen = next((m for m in self.metrics if m.sign), None)
         if chosen is None or len({name for name, _ in self.cells[chosen.name]}) < 2:
             return []
@@ -97,7 +99,7 @@ class Comparison:
             return []
         sure = f"ahead of {last.second} by {_shown(last.lead)}"
         if not last.lead.certain:
-            sure = f"which these seeds cannot tell from {last.second} (difference {_shown(last.lead)})"
+            sure = f"but the gain over {last.second} is not certain (difference {_shown(last.lead)})"
         return [f"{self.name}: {last.variant} has the best {chosen.label}{size}, {sure}."]
 
     def _sizes(self) -> list[int]:
@@ -111,8 +113,8 @@ class Comparison:
         head = ("transitions", "best", metric.label, "second", "lead", "")
         write_latex(self.out / "tables" / f"{self.slug}-best.tex", f"{self.name}: best configurations", head, rows)
         note = (
-            "The lead is in pairs of one seed, positive where the best is better. The best was chosen by these seeds, so that "
-            "its lead is somewhat flattered."
+            "Lead: mean difference to the second, compared seed by seed; positive where the best is better. The best was "
+            "chosen on the same seeds, so its lead is slightly optimistic."
         )
         return {"title": f"{self.name}: best configuration", "note": note, "head": head, "rows": rows}
 
@@ -131,7 +133,7 @@ class Comparison:
         )
         counts = sorted({m.seeds for m in means.values()})
         how = f"{counts[0]} seeds" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
-        return {"title": f"{self.name}: {metric.label}", "note": f"Over {how}.", "head": head, "rows": rows}
+        return {"title": f"{self.name}: {metric.label}", "note": f"Mean over {how}.", "head": head, "rows": rows}
 
     def _differences(self, metric: Metric) -> list[dict[str, Any]]:
         cells, sizes = self.cells[metric.name], self._sizes()
@@ -146,7 +148,7 @@ class Comparison:
             if name != base and (name, n) in cells and (base, n) in cells
         }
         rows = [(name, *(_shown(found.get((name, n))) for n in sizes)) for name in names if name != base]
-        head = (f"less {base}", *map(_size, sizes))
+        head = (f"minus {base}", *map(_size, sizes))
         stem = self.out / "tables" / f"{self.slug}-{metric.name}-differences"
         write_latex(stem.with_suffix(".tex"), f"{self.name}: {metric.label}, difference to {base}", head, rows)
         write_csv(
@@ -155,7 +157,7 @@ class Comparison:
             [(name, base, n, m.value, m.low, m.high, m.seeds) for (name, n), m in found.items()],
         )
         better = "above" if metric.sign > 0 else "below"
-        note = f"In pairs of one seed; {better} zero is better than {base}. An interval that holds zero tells nothing apart."
+        note = f"Compared seed by seed; {better} zero: better than {base}. If the interval contains 0, the gain is not certain."
         title = f"{self.name}: {metric.label}, difference to {base}"
         return [{"title": title, "note": note, "head": head, "rows": rows}]
 
@@ -174,7 +176,7 @@ class Comparison:
         if not courses:
             return []
         path = draw_courses(courses, label, across, self.out / f"{self.slug}-learning.png")
-        return [figure(path) | {"title": f"{self.name}: learning curves", "note": "A line per run and seed."}]
+        return [figure(path) | {"title": f"{self.name}: learning curves", "note": "One line per run and seed."}]
 
     def _calibration(self) -> list[dict[str, Any]]:
         size = max(self._sizes(), default=0)
@@ -182,7 +184,7 @@ class Comparison:
         for run in self.runs:
             path = run.found.directory / "calibration.parquet"
             if (run.rows[0]["n_train"] or 0) == size and path.is_file():
-                with contextlib.suppress(Exception):  # a damaged file costs its own line
+                with contextlib.suppress(Exception):  # a damaged file is left out
                     table = read_columns(path)
                     joint = table["output"] == "joint"
                     gathered.setdefault(run.variant, []).append({c: table[c][joint] for c in ("level", "fraction")})
@@ -193,7 +195,7 @@ class Comparison:
             for name, tables in gathered.items()
         }
         path = draw_calibrations(columns, self.out / f"{self.slug}-calibration.png")
-        note = f"Joint over outputs{f', n = {size}' if size else ''}: means over runs, bands from the smallest to the largest."
+        note = f"Test data, all outputs{f', n = {size}' if size else ''}. Lines: means; bands: smallest to largest run."
         return [figure(path) | {"title": f"{self.name}: calibration", "note": note}]
 
     def _verdicts(self) -> list[dict[str, Any]]:
@@ -216,7 +218,7 @@ def _shown(found: Mean | None) -> str:
 def _certain(found: Mean) -> str:
     if found.seeds < 2:
         return "one seed" if found.seeds else ""
-    return "certain" if found.certain else "not certain"
+    return "the gain is certain" if found.certain else "the gain is not certain"
 
 
 def _size(size: int) -> str:

@@ -16,9 +16,9 @@ from simpel_cli.runs.files import read_columns
 
 KINDS = {
     "effect": "An effect was found.",
-    "ambiguous": "Something is missing; these data cannot tell which of several causes it is.",
-    "none": "Nothing was found to be missing.",
-    "unexplained": "Something is missing that no known effect explains.",
+    "ambiguous": "Something is missing; these data do not determine which of several causes it is.",
+    "none": "No missing effect was found.",
+    "unexplained": "Something is missing, and no known effect explains it.",
 }
 MOST_NAMED = 6  # effects that were not found, in the terminal
 
@@ -70,7 +70,9 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     )
     if small:
         more = len(good) - MOST_NAMED
-        terminal.line(f"Not found, and smaller than: {small}" + (f" · {more} more in the report" if more > 0 else ""))
+        terminal.line(
+            f"Not found; if present, smaller than: {small}" + (f" · {more} more in the report" if more > 0 else "")
+        )
     outside = untested(read_columns(directory / "coverage.parquet")) + in_words(found.get("not_tested", []))
     if outside:
         terminal.line(f"Not tested by these data: {', '.join(outside)}")
@@ -99,7 +101,7 @@ def _number(value: float) -> str:
 
 
 def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]) -> list[str]:
-    """Return commands to go on with, as they can be typed where this one was."""
+    """Return the next commands, as they can be typed in the same directory."""
     chosen = config.get("choices") or {}
     own = f" --config-dir {typed(chosen['config_dir'])}" if chosen.get("config_dir") else ""
     what = (
@@ -114,7 +116,7 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         lines.append(
             f"simpel fit --config-dir {typed(directory / 'conf')} sim={name} data={chosen.get('data', '')}{past}"
         )
-    lines.append(f"simpel fit{own} {what}          # with the simulator as it is")
+    lines.append(f"simpel fit{own} {what}          # with the declared simulator")
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")
     return lines

@@ -1,4 +1,4 @@
-"""What the report of a search says, section by section; it reads the verdict and the tables, nothing else."""
+"""The sections of the report of a search, made from the verdict and the tables only."""
 
 import difflib
 import re
@@ -15,9 +15,9 @@ from simpel_cli.reporting.figures.canvas import with_interval, with_unit
 from simpel_cli.reporting.html import figure
 from simpel_cli.runs.files import read_columns
 
-AT_REST = -20.0  # nats: a fit so far below the model that it contains has not come to rest, and its spread says nothing
+AT_REST = -20.0  # nats: a fit so far below the simpler model has not converged, and its spread has no meaning
 NEAR_RANGE = 0.95  # share of a declared range that counts as all of it
-HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "free run"}
+HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
 Section = dict[str, Any]
 Table = Mapping[str, np.ndarray]
 
@@ -56,7 +56,7 @@ def sections_of(
 
 
 def words(name: str) -> str:
-    """Name of an effect as a person writes it."""
+    """Name of an effect in words."""
     return name.replace("_", " ")
 
 
@@ -66,7 +66,7 @@ def rows_of(table: Table) -> list[dict[str, Any]]:
 
 
 def error_section(found: Mapping[str, Any], errors: Table) -> Section:
-    """Errors on held-out episodes, before and after."""
+    """Errors on test episodes, before and after."""
     error = found["error"]
     both = bool(found["effects"])
     rows = []
@@ -85,15 +85,16 @@ def error_section(found: Mapping[str, Any], errors: Table) -> Section:
     n = error["episodes"]
     fitted = "the simulator with its parameters fitted to the training episodes"
     note = (
-        f"Root mean square errors on {n} held-out episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
+        f"Root mean square errors on {n} test episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
         + (
-            " (before) and of the same with the effects (after): what is gained is the effects' alone. "
+            " (before), and of the same with the effects (after): the reduction is due to the effects alone. "
             if both
             else ". "
         )
-        + ("Intervals: 95 % bootstrap, resampling episodes." if n > 1 else "One episode gives no interval.")
+        + "Whole episode: the simulator gets the inputs only. "
+        + ("Intervals: 95 % bootstrap over episodes." if n > 1 else "One episode gives no interval.")
     )
-    title = "Error before and after" if both else "Error of the calibrated simulator"
+    title = "Test error before and after" if both else "Test error of the calibrated simulator"
     return {"title": title, "head": head, "rows": rows, "note": note}
 
 
@@ -118,13 +119,15 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
         lacks = found.get("corrected_sim_lacks")
         if lacks:
-            text = f"The corrected YAML lacks {'; '.join(words(name) for name in lacks)}. The errors above are with it."
+            text = (
+                f"Not in the corrected YAML: {'; '.join(words(name) for name in lacks)}. The errors above include it."
+            )
     title = "The equation before and after" if found["effects"] else "The equation"
     return {"title": title, "equations": blocks, "after": text}
 
 
 def _rates(sim: Mapping[str, Any]) -> dict[str, str]:
-    """Return the right-hand sides that a `sim:` node tells; of equations in Python what was added to them."""
+    """Return the right-hand sides that a `sim:` node declares; of equations in Python what was added to them."""
     rates = {s: str(e) for s, e in (sim.get("dynamics") or {}).items()}
     if not isinstance(base := sim.get("base"), Mapping):
         return rates
@@ -137,7 +140,7 @@ def _as_in(sim: Mapping[str, Any]) -> str:
 
 
 def _timing(sim: Mapping[str, Any]) -> list[str]:
-    """Say how inputs act otherwise than they are given: changed, late or slowly."""
+    """Describe inputs that act differently from their recorded values: changed, delayed or with a lag."""
     lines = _timing(base) if isinstance(base := sim.get("base"), Mapping) else []
     for name, node in (sim.get("inputs") or {}).items():
         if "value" in node:
@@ -171,12 +174,12 @@ def step_section(found: Mapping[str, Any]) -> Section:
         + [_number(step["error"][kind].get(name)) for name in names for kind in ("horizon", "free_run")]
         for step in steps
     ]
-    head = [f"{name}, {kind}" for name in names for kind in (f"{horizon} rows ahead", "free run")]
+    head = [f"{name}, {kind}" for name in names for kind in (f"{horizon} rows ahead", "whole episode")]
     return {
         "title": "Step by step",
         "head": ["added", *head],
         "rows": rows,
-        "note": "RMSE on the test episodes after each effect was added, all parameters fitted anew.",
+        "note": "Test RMSE after each effect was added, with all parameters fitted again.",
     }
 
 
@@ -203,13 +206,13 @@ def effect_section(found: Mapping[str, Any]) -> Section:
     if not rows:
         return {}
     return {
-        "title": "What was added",
-        "head": ["effect", "size (90 %)", "evidence", "held-out gain (95 %)", "as good as it"],
+        "title": "Effects that were added",
+        "head": ["effect", "size (90 %)", "evidence", "held-out gain (95 %)", "equally good alternatives"],
         "rows": rows,
         "text": True,
-        "note": "Evidence: what the model loses without the effect, everything else fitted anew; "
-        f"{ACCEPT:g} nat are asked of one effect, {FURTHER:g} more of each for every further one. "
-        "Held-out gain: log likelihood of training episodes that the parameters were not fitted to.",
+        "note": "Evidence: loss in log evidence without the effect, with all other parameters fitted again. "
+        f"One effect must gain {ACCEPT:g} nat; every further effect raises this by {FURTHER:g} nat for each of them. "
+        "Held-out gain: gain in log likelihood on training episodes that the parameters were not fitted to.",
     }
 
 
@@ -230,59 +233,59 @@ def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
         "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
         "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
         "rows": rows,
-        "note": "With 90 % intervals. One whose interval fills its range is not determined by these data"
-        + ("; one that moves far was making up for what the simulator lacked." if found["effects"] else "."),
+        "note": "With 90 % intervals. A parameter whose interval fills its range is not determined by these data"
+        + ("; one that changes a lot compensated for the missing effect." if found["effects"] else "."),
     }
 
 
 def remainder_section(found: Mapping[str, Any]) -> Section:
-    """What no effect explains."""
+    """Model error that no effect explains."""
     rest = found["remainder"]
     if not rest:
         return {}
     rms = rest.get("rms", np.nan)
     size = f", with a root mean square of {rms:.3g} {rest['unit']}" if np.isfinite(rms) else ""
     return {
-        "title": "What is left unexplained",
-        "note": f"Something acts on d({rest['acts_on']})/dt that depends on {dependence(rest)}{size}, and no "
-        "effect of the catalogue explains it. The figure of the latent force shows its shape; an effect of your own is one "
-        "YAML file with an expression (conf/effect/).",
+        "title": "Unexplained model error",
+        "note": f"The model error in d({rest['acts_on']})/dt depends on {dependence(rest)}{size}. No known effect "
+        "explains it. The figure of the latent force shows its shape. To add an effect of your own, write one YAML file "
+        "with an expression (conf/effect/).",
     }
 
 
 def reliable(found: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
-    """Split what was not found into what has a size and what was left before its fit came to rest."""
+    """Split the effects that were not found by whether their fit converged, so that their size is known."""
     entries = found["not_found"]
     good = [e for e in entries if (e.get("log_evidence_gain") or 0.0) > AT_REST]
     return good, [e for e in entries if e not in good]
 
 
 def not_found_section(found: Mapping[str, Any]) -> Section:
-    """Effects that were looked for, and how small they must be."""
+    """Effects that were tested and not found, with an upper bound of their size."""
     good, rest = reliable(found)
     if not good and not rest:
         return {}
     rows = [
         [f"{words(e['name'])} on {e['acts_on']}", e.get("parameter", ""),
          f"{e['smallest_detectable']:.2g} {e['unit']}".removesuffix(" 1"),
-         f"{e['log_evidence_gain']:.1f} nat" if e.get("log_evidence_gain") is not None else "screened"]
+         f"{e['log_evidence_gain']:.1f} nat" if e.get("log_evidence_gain") is not None else "not fitted"]
         for e in sorted(good, key=lambda e: (e["name"], e["acts_on"]))
     ]  # fmt: skip
     after = ""
     if rest:
         names = ", ".join(f"{words(e['name'])} on {e['acts_on']}" for e in rest)
-        after = f"Stopped early, since they could not have earned enough evidence; their size is not known: {names}."
+        after = f"Stopped early, because they could not reach the required evidence; their size is not known: {names}."
     return {
-        "title": "What was not found, and how small it must be",
+        "title": "Effects that were not found, and their largest possible size",
         "head": ["effect", "parameter", "smaller than", "gain in evidence"],
         "rows": rows,
-        "note": "An effect of the size stated would have earned its place.",
+        "note": "An effect of the stated size would have been accepted.",
         "after": after,
     }
 
 
 def coverage_section(coverage: Table) -> Section:
-    """Where the data say something, and where not."""
+    """Range of the training data against the declared ranges."""
     rows = []
     for row in rows_of(coverage):
         share = (row["high"] - row["low"]) / (row["range_high"] - row["range_low"])
@@ -293,15 +296,15 @@ def coverage_section(coverage: Table) -> Section:
     if not rows:
         return {}
     return {
-        "title": "What these data tested",
+        "title": "Range of the training data",
         "head": ["", "training data", "declared range", "share"],
         "rows": rows,
-        "note": "Nothing here says what happens outside of the span of the training data.",
+        "note": "The results do not apply outside the range of the training data.",
     }
 
 
 def untested(coverage: Table) -> list[str]:
-    """Return what the data did not reach, in words."""
+    """Return the ranges that the data do not cover, in words."""
     found = []
     for row in rows_of(coverage):
         share = (row["high"] - row["low"]) / (row["range_high"] - row["range_low"])
@@ -318,34 +321,32 @@ def prior_section(found: Mapping[str, Any]) -> Section:
         for metric, old in metrics.items():
             if new := (fits.get("after") or {}).get(size, {}).get(metric):
                 name = {"nll": "NLL", "nrmse": "normalised RMSE"}.get(
-                    metric, metric.replace("free_run_rmse@", "free run ")
+                    metric, metric.replace("free_run_rmse@", "RMSE after ")
                 )
                 rows.append([f"{size} transitions", name, with_interval(*old), with_interval(*new)])
-    note = (
-        "SimPEL on the same few training transitions, judged on the test episodes: median, smallest and largest seed."
-    )
-    head = ("", "", "simulator as it was", "corrected simulator")
-    return {"title": "As a prior for SimPEL", "head": head, "rows": rows, "note": note} if rows else {}
+    note = "SimPEL fitted to the same few transitions with either prior. Errors on test episodes: median (range) over seeds."
+    head = ("", "", "declared simulator", "corrected simulator")
+    return {"title": "Both simulators as prior for SimPEL", "head": head, "rows": rows, "note": note} if rows else {}
 
 
 def check_section(found: Mapping[str, Any]) -> Section:
-    """What was looked at in the data before any physics was blamed."""
-    rows = [(c["check"], "ok" if c["ok"] else "look", c["detail"]) for c in found["data_checks"]]
+    """Checks of the data, done before the search."""
+    rows = [(c["check"], "ok" if c["ok"] else "warning", c["detail"]) for c in found["data_checks"]]
     return {"title": "Data checks", "head": ("check", "", "what was found"), "rows": rows, "text": True} if rows else {}
 
 
 def next_section(found: Mapping[str, Any]) -> Section:
-    """Which experiment would tell tied causes apart."""
+    """The experiment that would distinguish the possible causes."""
     plan = found["next_experiment"]
     if not plan:
         return {}
     rows = [
         [words(p["true"]), words(p["against"]), f"{p['expected_log_likelihood_ratio']:.1f} nat"] for p in plan["pairs"]
     ]
-    head = ["if this is the cause", "it beats", "by, expected"]
+    head = ["if this is the cause", "compared with", "expected gain"]
     after = (
-        f"{plan['file']} holds time, inputs and what each cause predicts. Expected: how much the log evidence changes when "
-        "the episode is added to these data, with what is still uncertain about the parameters of both."
+        f"{plan['file']} contains time, inputs and the prediction of each cause. Expected gain: expected change of the log "
+        "evidence when the episode is added to these data; the uncertainty of the parameters of both causes is included."
         if plan["file"]
         else ""
     )

@@ -1,4 +1,4 @@
-"""`simpel doctor`: what this installation has, and a self-test of a few seconds of what results rest on."""
+"""`simpel doctor`: the parts of this installation, and a numerical self-test of a few seconds."""
 
 import os
 import platform
@@ -18,18 +18,18 @@ from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.manifest import versions
 from simpel_cli.runs.settings import Settings, cache_directory, configure
 
-MARKS = {"ok": "ok", "look": "look", "wrong": "WRONG"}
+MARKS = {"ok": "ok", "look": "warning", "wrong": "WRONG"}
 LEAST_DISK = 2e9  # bytes
 LEAST_MEMORY = 3e9
 
 
 class Finding(NamedTuple):
-    """One line of the doctor's.
+    """One line of the table.
 
     Args:
-        what: was looked at.
-        state: ok, look (it will do, but see), or wrong (do not trust results).
-        detail: what was found, and the cure.
+        what: was tested.
+        state: ok, look (works, with a warning), or wrong (do not trust results).
+        detail: what was found, and what to do.
     """
 
     what: str
@@ -38,7 +38,7 @@ class Finding(NamedTuple):
 
 
 def doctor() -> None:
-    """Look at the installation and test it.
+    """Test the installation.
 
     Raises:
         SimpelError: something is wrong.
@@ -57,7 +57,7 @@ def doctor() -> None:
 def _surroundings() -> Iterator[Finding]:
     yield Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}")
     for name, version in versions().items():
-        yield Finding(name, "ok" if version else "wrong", version or "missing: set simpel up again, `make install`")
+        yield Finding(name, "ok" if version else "wrong", version or "missing: install simpel again, `make install`")
     yield _device()
     yield _threads()
     yield _cache()
@@ -68,14 +68,16 @@ def _surroundings() -> Iterator[Finding]:
     yield _recordings()
     for name, what in (("cc", "simpel export: C code"), ("chromium", "tests of reports")):
         there = shutil.which(name)
-        yield Finding(name, "ok", there or f"not there; only {what} would use it")
+        yield Finding(name, "ok", there or f"not installed; needed for {what} only")
 
 
 def _device() -> Finding:
     import jax
 
     device = configure(Settings())
-    detail = f"{device.device_kind or device.platform} ({jax.default_backend()}), {len(jax.devices())} of them"
+    detail = (
+        f"{device.device_kind or device.platform} ({jax.default_backend()}), number of devices: {len(jax.devices())}"
+    )
     if device.platform == "cpu" and shutil.which("nvidia-smi"):
         return Finding("device", "look", f"{detail}; there is a GPU that JAX does not use: install jax[cuda13]")
     return Finding("device", "ok", detail)
@@ -94,7 +96,9 @@ def _cache() -> Finding:
         with tempfile.NamedTemporaryFile(dir=folder):
             pass
     except (OSError, SimpelError) as error:
-        return Finding("cache", "look", f"not writable ({error}): every run compiles anew; set XDG_CACHE_HOME")
+        return Finding(
+            "cache", "look", f"not writable ({error}): every run compiles its programs again; set XDG_CACHE_HOME"
+        )
     files = [path for path in folder.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / 1e6
     return Finding("cache", "ok", f"{folder}: {len(files)} files, {size:.0f} MB; it may be deleted at any time")
@@ -104,7 +108,7 @@ def _memory() -> Finding:
     try:
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):
-        return Finding("memory", "look", "this system does not tell")
+        return Finding("memory", "look", "not reported by this system")
     return _room("memory free", float(free), LEAST_MEMORY, "a fit takes about 1 GB, a policy 1.5 GB")
 
 
@@ -115,7 +119,7 @@ def _room(what: str, free: float, least: float, cure: str) -> Finding:
 
 def _recordings() -> Finding:
     folder = recordings_dir()
-    there = str(folder) if folder.is_dir() else "no recordings here; experiments that need them say so"
+    there = str(folder) if folder.is_dir() else "not set; only experiments with recorded data need it"
     return Finding("SIMPEL_SHARED", "ok", there)
 
 
@@ -147,7 +151,7 @@ def _simulator() -> tuple[bool, str]:
     exact = casadi.integrator("exact", "cvodes", ode, 0, model.dt, {"reltol": 1e-11, "abstol": 1e-12})(x0=s)["xf"]
     target = encoding.to_y(s, np.asarray(exact).ravel(), np.zeros(0))
     error = float(np.abs(target - found).max())
-    return error < 1e-4, f"a transition in JAX agrees with CasADi's integrator to {error:.0e}"
+    return error < 1e-4, f"a transition in JAX agrees with CasADi's integrator, difference {error:.0e}"
 
 
 def _linear_algebra() -> tuple[bool, str]:
@@ -168,7 +172,7 @@ def _linear_algebra() -> tuple[bool, str]:
         float(jnp.abs(found - answer).max())
         for found in (solve(matrix, right), factor(matrix, right[..., None])[..., 0])
     ]
-    return max(errors) < 1e-6, f"conjugate gradients and Cholesky are right to {max(errors):.0e}"
+    return max(errors) < 1e-6, f"conjugate gradients and Cholesky: error {max(errors):.0e}"
 
 
 def _gradient() -> tuple[bool, str]:
@@ -181,7 +185,7 @@ def _gradient() -> tuple[bool, str]:
 
     found = float(jax.jit(jax.grad(decayed))(jnp.float32(0.02)))
     error = float(abs(found / (-50 * np.exp(-1.0)) - 1))
-    return error < 1e-4, f"a gradient through 50 steps in single precision is right to {error:.0e}"
+    return error < 1e-4, f"a gradient through 50 steps in single precision: relative error {error:.0e}"
 
 
 def _files() -> tuple[bool, str]:
@@ -197,7 +201,7 @@ def _files() -> tuple[bool, str]:
         write_metrics(folder / "metrics.parquet", [{"metric": "nll", "value": 0.1}], {"seed": 1})
         (row,) = read_metrics(folder / "metrics.parquet")
     same = bool(np.array_equal(leaves["a"], array)) and facts == {"step": 3} and (row["value"], row["seed"]) == (0.1, 1)
-    return same, "checkpoint and metrics come back as written" if same else "what was written came back changed"
+    return same, "checkpoint and metrics are read back unchanged" if same else "a written file was read back changed"
 
 
 TESTS: dict[str, Callable[[], tuple[bool, str]]] = {

@@ -1,4 +1,4 @@
-"""`simpel example DIR`: the folder of a rig, to be changed into one's own."""
+"""`simpel example DIR`: a complete example folder, to be adapted to a rig."""
 
 import shutil
 from pathlib import Path
@@ -17,16 +17,18 @@ def example(folder: Path) -> None:
         ConfigError: the folder has something in it, or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder}: is there and not empty. Name a new folder, or an empty one; nothing was changed.")
+        raise ConfigError(
+            f"{folder}: exists and is not empty. Name a new folder, or an empty one; nothing was changed."
+        )
     make_directory(folder, "DIR")
     shutil.copytree(SOURCE, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     terminal = Terminal(quiet=False)
-    terminal.line(f"{folder}/README.md says what is what", "written")
+    terminal.line(f"{folder}/README.md explains every file", "written")
     given = f"--config-dir {typed(folder)}"
     terminal.next(
         (
-            f"simpel sims cart {given}          # is that the simulator you meant?",
+            f"simpel sims cart {given}          # shows the simulator",
             f"simpel fit {given} experiment=cart",
-            f"simpel discover {given} experiment=cart    # what does it lack?",
+            f"simpel discover {given} experiment=cart    # searches for missing effects",
         )
     )

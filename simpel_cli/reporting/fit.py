@@ -34,13 +34,13 @@ METRICS = {
 }
 
 NOTE = (
-    "Normalised RMSE is in units of the simulator's own spread of the target over its declared ranges; jointly, the root "
-    "mean square over outputs. Joint errors in data units are shown where all outputs share a unit."
+    "Normalised RMSE: RMSE divided by the standard deviation of the simulator's own output over its declared ranges; joint: "
+    "root mean square over outputs. Joint errors in data units are shown where all outputs share a unit."
 )
 
 
 def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorCheck | None) -> None:
-    """Say in a few lines what was understood."""
+    """Print data, simulator and prior in a few lines."""
     s, recording, source = study.settings, study.recording, study.system.source
     seeds = f"seed {s.seed}" if s.seeds == 1 else f"seeds {s.seed}..{s.seed + s.seeds - 1}"
     terminal.line(
@@ -50,21 +50,21 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
     rows = len(fitted.training[0][0])
     describe_data(terminal, recording, f"{split_summary(recording)}, {used(study.method, source, rows)}")
     uncertain = " ".join(q.name for q in source.params) or "nothing"
-    kind = "" if study.system.transition is not None else " (queried)"
-    terminal.line(f"{source.name}{kind}   uncertain: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+    kind = "" if study.system.transition is not None else " (black box)"
+    terminal.line(f"{source.name}{kind}   uncertain parameters: {uncertain}   {_gap_text(study, fitted)}", "simulator")
     if checked is not None:
         describe_prior(terminal, checked)
 
 
 def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
-    """Say which file was read, what of it is used, and what to look at."""
+    """Print which file was read, what of it is used, and the warnings of the checks."""
     failed = [c for c in recording.checks if not c.ok]
     if not recording.files:
         terminal.line("no measurements: the posterior is the prior", "data")
         return
     terminal.line(
         f"{recording.files[0]}   {used}   checks {len(recording.checks) - len(failed)} ok"
-        + (f", {len(failed)} to look at" if failed else ""),
+        + (f", {len(failed)} with warnings" if failed else ""),
         "data",
     )
     for check in failed:
@@ -74,9 +74,9 @@ def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
 
 
 def used(method: Method, source: Any, rows: int) -> str:
-    """What was trained on; a simulator without states has no step, hence no dt."""
+    """Number of training transitions; a simulator without states has no time step."""
     most = getattr(method, "most_rows", rows)
-    beyond = f" (of which the method takes {most}, evenly: method.most_rows)" if rows > most else ""
+    beyond = f" (the method takes {most} of them, evenly spaced: method.most_rows)" if rows > most else ""
     return f"{rows} transitions used{beyond}, dt {source.dt:g} s" if source.states else f"{rows} rows used{beyond}"
 
 
@@ -88,25 +88,25 @@ def _gap_text(study: Study, fitted: Fitted) -> str:
     length = gap.lengthscale if gap.lengthscale is not None else 2 * study.system.encoding.dim_x**0.5
     scale = " ".join(f"{v:.2g}" for v in fitted.assembled.gap_scale)
     what = "gap GP" if study.prior.uses_simulator else "GP prior, no simulator"
-    return f"{what}: {words}, l {length:.3g}, kappa {scale}"
+    return f"{what}: {words}, length scale {length:.3g}, scale kappa {scale}"
 
 
 def describe_evaluation(terminal: Terminal, run: Path, step: int, study: Study, judged_on: Study) -> None:
-    """Say which fit is judged, and on what."""
+    """Print which fit is tested, and on which data."""
     terminal.line(f"simpel evaluate · {run} · step {step}", style="bold")
     rows = held_out_summary(judged_on.recording)
-    what = f"the test split of the fit, {rows}" if judged_on is study else f"all of it, {rows}, new to the fit"
+    what = f"the test split of the fit, {rows}" if judged_on is study else f"all of it, {rows}, not used in the fit"
     describe_data(terminal, judged_on.recording, what)
 
 
 def publish(terminal: Terminal, fit: Study, fitted: Fitted, study: Study, judged: Judged, manifest: Manifest) -> None:
-    """Print the test results, draw the figures, write the report, and say where things lie and what to type next.
+    """Print the test results, draw the figures, write the report, and print the paths and the next commands.
 
     Args:
         terminal: to print to.
         fit: what was fitted.
         fitted: its problems, as they were trained.
-        study: what was judged, on its measurements.
+        study: what was tested, with the measurements.
         judged: the results.
         manifest: of the verb that runs.
     """
@@ -121,17 +121,17 @@ def publish(terminal: Terminal, fit: Study, fitted: Fitted, study: Study, judged
     free = _free_run_table(study, values)
     if free is not None:
         terminal.line(aligned(free["head"], free["rows"]))
-    spread = "the smallest and largest interval end over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
+    spread = "95 % bootstrap, outermost ends over seeds" if study.settings.seeds > 1 else "95 % bootstrap"
     terminal.line(f"(intervals: {spread}, resampling {judged.blocks})", style="dim")
     next_commands = _next(study, source)
     what = "One step ahead" if study.system.encoding.states else "Predictions"
-    tables = [table | {"title": f"{what}, held-out data", "note": NOTE}]
+    tables = [table | {"title": f"{what}, test data", "note": NOTE}]
     if free is not None:
-        tables.append(free | {"title": "Free run, root mean square error"})
+        tables.append(free | {"title": "Error ahead, test data"})
     checks = {
         "title": "Data checks",
         "head": ("check", "", "what was found"),
-        "rows": [(c.name, "ok" if c.ok else "look", c.detail) for c in study.recording.checks],
+        "rows": [(c.name, "ok" if c.ok else "warning", c.detail) for c in study.recording.checks],
         "text": True,
     }
     s = study.settings
@@ -218,11 +218,11 @@ def _free_run_table(study: Study, values: Values) -> dict[str, Any] | None:
     rows = [
         (_named(q.name, q.unit), *(_shown(values[m, q.name]) for m in metrics)) for q in study.system.encoding.states
     ]
-    return {"head": ("free run, RMSE", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
+    return {"head": ("RMSE ahead", *(m.split("@")[1].replace("s", " s ahead") for m in metrics)), "rows": rows}
 
 
 def _next(study: Study, fit: Path) -> list[str]:
-    """Return commands to go on with, as they can be typed where this one was."""
+    """Return the next commands, as they can be typed in the same directory."""
     chosen = study.choices
     own = f" --config-dir {typed(chosen['config_dir'])}" if chosen.get("config_dir") else ""
     what = (
@@ -233,7 +233,7 @@ def _next(study: Study, fit: Path) -> list[str]:
     used = study.measurements.n_train
     sizes = f"{max(2, used // 2)},{used}" if used else "10,20"
     return [
-        f"simpel evaluate {typed(fit)}          # with data=NAME: on all of a new file",
+        f"simpel evaluate {typed(fit)}          # tests again; data=NAME tests on another file",
         f"simpel sweep{own} {what} method=simpel,fsvgd data.n_train={sizes} 'run.seed=range(3)'",
     ]
 

@@ -44,7 +44,7 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } summary {
 {% if section.image %}<img alt="{{ section.title }}" width="{{ section.width }}"
  src="data:image/{{ section.image }}">{% endif %}
 {% if section.after %}<p>{{ section.after }}</p>{% endif %}{% endfor %}
-<h2>Go on</h2><pre>{{ commands }}</pre>
+<h2>Next commands</h2><pre>{{ commands }}</pre>
 {% if config %}<h2>Configuration</h2>
 <details><summary>Every key, as resolved</summary><pre>{{ config }}</pre></details>{% endif %}
 </body></html>
@@ -52,70 +52,74 @@ pre { padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere } summary {
 
 FIGURES = {
     "prior_predictive": (
-        "What the simulator expected",
-        "Training targets of the first seed among draws of the simulator with its ranges, at the same inputs, in the order of "
-        "the draws' medians. The dark band holds 90 % of the draws, the light one all of them. Targets outside no parameters "
-        "explain: the gap GP has to, or an effect that the simulator lacks (simpel discover).",
+        "Prior predictive check",
+        "Training targets of the first seed and draws of the simulator with its parameter ranges, at the same inputs, sorted "
+        "by the median of the draws. Dark band: 90 % of the draws; light band: all draws. No parameters in the ranges explain "
+        "targets outside the bands: the gap GP has to, or an effect that the simulator lacks (simpel discover).",
     ),
-    "learning_curves": ("Training", "A loss that still falls asks for more steps (method.steps)."),
+    "learning_curves": ("Training", "If the training loss still falls at the end, use more steps (method.steps)."),
     "predictions": (
-        "Prediction against measurement",
-        "The dark band is the model's own uncertainty, the light band (or bar) adds the learned noise: 95 % of points lie "
-        "inside it when the model is right about itself.",
+        "Prediction and measurement, test data",
+        "Dark band: uncertainty of the model. Light band (or bar): the same with the learned noise. If the model is "
+        "calibrated, 95 % of the points lie inside the light band.",
     ),
     "calibration": ("Calibration", "Share of test targets inside the central region of a stated probability."),
     "free_run": (
-        "Free run",
-        "The model runs on its own predictions along the measured inputs. The claimed standard deviation is that "
-        "between the particles, plus the noise of one measurement. An error well above it asks for a better simulator.",
+        "Error ahead, test data",
+        "From a measured state on, the model predicts from its own predictions and the measured inputs. The predicted standard "
+        "deviation is that between the particles, plus the noise of one measurement. If the error is well above it, the "
+        "simulator needs to be improved.",
     ),
     "free_run_example": (
-        "One free run",
-        "The one whose error is the median of all free runs of the first seed. The band is two claimed standard deviations "
-        "to either side: the model's own uncertainty, grown along the way, and the noise of one measurement.",
+        "Example of a prediction ahead, test data",
+        "The prediction with the median error of all those of the first seed. The band is two predicted standard deviations to "
+        "either side: the uncertainty of the model, which accumulates with time, and the noise of one measurement.",
     ),
     "residual": (
-        "The latent force",
-        "What has to act beside the simulator for the measurements to come about, given all of them "
-        "(smoothed, never a finite difference). Points are rows; lines are means with their 95 % band. All are "
-        "given the same process noise, so that none is pulled to zero. One that lacks nothing leaves zero everywhere.",
+        "Latent force (model error)",
+        "The rate that has to be added to the simulator to explain the measurements, estimated from all of them by smoothing, "
+        "without finite differences. Points: rows; lines: means with their 95 % band. All models have the same process noise, "
+        "so that none is biased towards zero. For a simulator that lacks nothing the latent force is zero everywhere.",
     ),
     "effects": (
-        "What the effects explain",
-        "The latent force with the corrected parameters and the effects switched off, along the arguments of each effect, less "
-        "what effects on other arguments do. The black curve is the fit. The last panel has all effects in one: what they say "
-        "should act against what is seen; one with a memory has no curve and shows here.",
+        "Fitted effects and latent force",
+        "Latent force of the corrected simulator with the effects switched off, against the arguments of each effect, minus "
+        "the contribution of effects with other arguments. Black curve: the fit. Last panel: estimated latent force against "
+        "the sum of all effects. An effect with a memory has no curve and appears in the last panel only.",
     ),
     "traces": (
-        "Free runs",
-        "The test episode whose error is the median of all. After its first rows the simulator sees inputs only.",
+        "Simulation of a test episode",
+        "The test episode with the median error. After the first rows the simulator gets the inputs only.",
     ),
     "evidence": (
         "Evidence of every candidate",
-        "What each would add, everything else fitted anew. Amber: does as well in the final model, so that these data cannot "
-        "tell it from the accepted one. A named effect has to beat functions without a name. The axis is linear up to 10 nat, "
-        "logarithmic beyond; what is clearly excluded ends at its left edge.",
+        "Gain in log evidence of each candidate, with all other parameters fitted again. Amber: equally good in the final "
+        "model, so that these data do not distinguish it from the accepted effect. A known effect must gain more than an "
+        "unknown function. The axis is linear up to 10 nat and logarithmic beyond; bars of excluded candidates are cut off.",
     ),
     "whiteness": (
-        "Whether one-step errors are white",
-        "On test episodes, each error in units of the standard deviation that the model claims for it. Inside the grey the "
-        "errors have no memory. A wrong model can pass where its process noise is large: then it is corrected in every row.",
+        "Whiteness of the one-step errors, test data",
+        "Each error is divided by its predicted standard deviation. Inside the grey area no autocorrelation is detected. A "
+        "wrong model can pass this test if its process noise is large, because the filter then corrects it in every row.",
     ),
     "control/learning_curves": (
         "Learning the policy",
-        "What the mean of the policy earns, at looks along its training; a jump at the end is fine-tuning. The run keeps "
-        "the best in the model; the truth chooses nothing.",
+        "Return of the policy without exploration, evaluated during training; a jump at the end is due to fine-tuning. The "
+        "policy with the highest return in the model is kept; the true simulator is not used for this choice.",
     ),
     "control/returns": (
         "Returns",
-        "What every episode earned in the plant, and what the model had promised beforehand. A promise far above what is kept "
-        "is a policy that exploits the model. A surprise (NLL) that falls is a model that learns.",
+        "Return of every episode in the plant, and the return that the model predicted before it. If the prediction is much "
+        "higher, the policy exploits errors of the model. A falling NLL shows that the model improves.",
     ),
-    "control/trajectories": ("Courses", "Every state and command of the episodes. An angle runs on beyond a turn."),
-    "control/manoeuvre": ("The manoeuvre", "Of the last episode of an online run, else of that of the median return."),
+    "control/trajectories": ("Trajectories", "Every state and command of the episodes. Angles are unwrapped."),
+    "control/manoeuvre": (
+        "Manoeuvre",
+        "Animation of the last episode (rl-online) or of the episode with the median return (rl-offline).",
+    ),
     "errors": (
-        "Error by horizon",
-        "Root mean square on test episodes with 95 % intervals over episodes. No error can fall below the measurement noise.",
+        "Test error by horizon",
+        "RMSE on test episodes with 95 % intervals over episodes. The measurement noise is a lower bound of the error.",
     ),
 }
 
@@ -163,7 +167,7 @@ def write_report(
             see `figure`; and a paragraph `after`.
         commands: what to type next.
         config: the resolved configuration; empty: there is none.
-        opening: a sentence that says it all, in front of the lead.
+        opening: the main result in one sentence, in front of the lead.
     """
     from jinja2 import Environment
 

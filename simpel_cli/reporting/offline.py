@@ -29,10 +29,10 @@ def publish(
     judged: Episodes | None,
     directory: Path,
 ) -> None:
-    """Print the result, draw the figures, write the report, and say what to type next."""
+    """Print the result, draw the figures, write the report, and print the next commands."""
     study = model.study
     seeds = study.settings.all_seeds
-    head = ("seed", "return in the model", "return in the truth", "nine in ten episodes", "succeeded")
+    head = ("seed", "return in the model", "return in the true simulator", "90 % of the episodes", "success")
     rows = []
     for i, seed in enumerate(seeds):
         cells = [str(seed), f"{trained.model_returns[i]:.4g}"]
@@ -53,7 +53,7 @@ def publish(
     terminal.line()
     for row in rows:
         terminal.line(
-            f"seed {row[0]}: return in the model {row[1]}, in the truth {row[2]}, succeeded {row[4]}", "judged"
+            f"seed {row[0]}: return in the model {row[1]}, in the true simulator {row[2]}, success {row[4]}", "tested"
         )
     for seed, share in zip(seeds, trained.broken, strict=True):
         if share:
@@ -66,17 +66,17 @@ def publish(
         f"simpel evaluate {typed(directory / 'posterior')}          # the model that the policy was learned in",
     ]
     note = (
-        f"{asked.control.episodes} episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; intervals over "
-        "episodes."
+        f"{asked.control.episodes} test episodes of {asked.task.horizon} steps in the simulator {asked.truth_name}; 95 % "
+        "intervals over episodes."
         if judged is not None
-        else "There is no true world to judge in: name one with sim@truth=, or try the policy on the rig."
+        else "Not tested in a true simulator: name one with sim@truth=, or test the policy on the rig."
     )
     report = write_report(
         directory / "report.html",
         title=f"simpel rl-offline · {study.settings.name} · {study.choices.get('method', '')}",
         lead=f"{model.fitted.n_train} transitions of {study.recording.files[0].name}, "
         + (
-            f"{asked.policy.policies} policies per seed, of which the best in the model is kept."
+            f"{asked.policy.policies} policies per seed; the best in the model is kept."
             if asked.planner is None
             else f"planned {asked.planner.ahead} steps ahead in the model; no policy is learned."
         ),

@@ -9,15 +9,15 @@ from simpel_cli.runs.directory import typed
 
 
 def publish(run: OnlineRun) -> None:
-    """Draw the figures, write the report, and say what to type next."""
+    """Draw the figures, write the report, and print the next commands."""
     directory, last = run.directory, run.online.episodes - 1
     head = (
         "episode",
         "return",
-        "in the model",
-        "succeeded",
+        "return in the model",
+        "success",
         "steps",
-        "NLL before it was learned",
+        "NLL before training on it",
         "fit, s",
         "policy, s",
     )
@@ -32,14 +32,14 @@ def publish(run: OnlineRun) -> None:
     images = draw_online(directory) if run.settings.figures else []
     commands = [
         f"python {typed(directory / 'policy' / 'run_policy.py')} < states.jsonl          # the last policy; no JAX needed",
-        f"simpel rl-online --resume {typed(directory)} online.episodes={2 * run.online.episodes}          # more of them",
-        f"simpel evaluate {typed(run.folder(last) / 'posterior')} data=NAME          # the last model, on a file of yours",
+        f"simpel rl-online --resume {typed(directory)} online.episodes={2 * run.online.episodes}          # more episodes",
+        f"simpel evaluate {typed(run.folder(last) / 'posterior')} data=NAME          # tests the last model on your own file",
     ]
     report = write_report(
         directory / "report.html",
         title=f"simpel rl-online · {run.settings.name} · {run.declared.choices.get('method', '')}",
-        lead=f"{run.online.episodes} episodes of {run.asked.task.horizon} steps in {run.world}; no data before "
-        "the first, whose policy was learned in the prior.",
+        lead=f"{run.online.episodes} episodes of {run.asked.task.horizon} steps in {run.world}. The policy of "
+        "the first episode was learned in the prior, without data.",
         sections=[
             {"title": "Episodes", "head": head, "rows": rows},
             task_table(run.asked),

@@ -23,7 +23,7 @@ from simpel_cli.runs.finding import Found, runs_below
 from simpel_cli.runs.manifest import read_manifest
 from simpel_cli.runs.metrics import read_metrics
 
-NAMED = 20  # of the runs that are not done
+NAMED = 20  # runs without results that are listed
 
 
 def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet: bool = False) -> Path:
@@ -44,7 +44,7 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
     names = distinct(run.variant for run in runs)
     if baseline is not None and baseline not in names:
         raise ConfigError(
-            f"--baseline: got {baseline}, which no run is of.{did_you_mean(baseline, names)} (there are {', '.join(names)})"
+            f"--baseline: got {baseline}; no run has this method.{did_you_mean(baseline, names)} (there are {', '.join(names)})"
         )
     if (out / "manifest.json").exists():
         raise ConfigError(f"--out: {out} is the directory of a run, which has a report of its own. Name another one.")
@@ -61,7 +61,7 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
     lead = (
         f"{len(runs)} finished runs of {len(names)} {'method' if len(names) == 1 else 'methods'}, {len(seeds)} "
         f"{'seed' if len(seeds) == 1 else 'seeds'}. Means are over seeds, with 95 % intervals (Student's t) in brackets; "
-        "differences are in pairs of one seed."
+        "differences are computed seed by seed."
     )
     path = write_report(
         out / "report.html",
@@ -81,7 +81,7 @@ def report(roots: Sequence[Path], out: Path, baseline: str | None = None, quiet:
 
 
 def default_folder(roots: Sequence[Path]) -> Path:
-    """Return where the report goes: a sweep has room for one; a run has a report of its own, a folder may hold anything."""
+    """Return the folder of the report: that of a single sweep, else a new one (a run has its own report already)."""
     if len(roots) == 1 and any((roots[0] / mark).exists() for mark in ("sweep.json", "sweep.parquet")):
         return roots[0]
     return Path("runs") / "report" / f"{datetime.now():%Y%m%d-%H%M%S}"
@@ -108,15 +108,15 @@ def _read(found: Sequence[Found]) -> tuple[list[Run], list[Found]]:
             except SimpelError:
                 unread.append(each)
     if not runs:
-        states = Counter(each.status or "not begun" for each in found)
+        states = Counter(each.status or "not started" for each in found)
         counted = ", ".join(f"{count} {state}" for state, count in states.items())
-        raise ConfigError(f"report: of {len(found)} runs none is done with metrics that can be read ({counted}).")
+        raise ConfigError(f"report: none of the {len(found)} runs is complete with readable metrics ({counted}).")
     panels = distinct(run.panel for run in runs)
     return [run for panel in panels for run in _apart([run for run in runs if run.panel == panel])], unread
 
 
 def _apart(runs: Sequence[Run]) -> list[Run]:
-    """Return runs that are compared with each other, of whose words only those are left that tell them apart."""
+    """Return runs that are compared with each other, with only those overrides that distinguish them."""
     shared = set.intersection(*(set(run.words) for run in runs))
     return [run._replace(words=tuple(word for word in run.words if word not in shared)) for run in runs]
 
@@ -152,23 +152,23 @@ def _cost(runs: Sequence[Run], out: Path) -> dict[str, Any]:
                 f"{sum(wall) / 3600:.3g}",
             )
         )
-    head = ("", "runs", "s per run, median", "of them training, median", "hours in all")
+    head = ("", "runs", "s per run, median", "s of training, median", "hours in total")
     write_latex(out / "tables" / "cost.tex", "Cost", head, rows)
     write_csv(out / "tables" / "cost.csv", ("variant", "runs", "wall_seconds", "train_seconds", "total_seconds"), full)
-    note = "By the clock, as the manifests tell; runs beside each other count each."
+    note = "Wall-clock times from the manifests; runs in parallel are added up."
     return {"title": "Cost", "note": note, "head": head, "rows": rows}
 
 
 def _left(found: Sequence[Found], unread: Sequence[Found]) -> list[dict[str, Any]]:
-    """Return what is not in the comparison, by name."""
+    """Return the runs that are not in the comparison."""
     left = [each for each in found if each.status != "done"]
-    rows = [(str(each.directory), each.status or "not begun", " ".join(each.words)) for each in left]
+    rows = [(str(each.directory), each.status or "not started", " ".join(each.words)) for each in left]
     rows += [(str(each.directory), "done, metrics not readable", " ".join(each.words)) for each in unread]
     if not rows:
         return []
     after = f"and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
     head = ("directory", "status", "overrides")
-    return [{"title": "Not in the comparison", "head": head, "rows": rows[:NAMED], "text": True, "after": after}]
+    return [{"title": "Runs without results", "head": head, "rows": rows[:NAMED], "text": True, "after": after}]
 
 
 def _median(values: Sequence[float]) -> float:

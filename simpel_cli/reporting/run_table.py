@@ -1,4 +1,4 @@
-"""The report's table of how a result came about: data used, what was learned beside the networks, software, time."""
+"""The report's table of a run: data used, learned noise and scales, software, time."""
 
 import platform
 from typing import Any
@@ -14,7 +14,7 @@ PHASES = (("compilation", "compile_seconds"), ("training", "train_seconds"))
 
 
 def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) -> dict[str, Any]:
-    """Return the table of a fit, or of an evaluation and the fit that it judges.
+    """Return the table of a fit, or of an evaluation and the fit that it tests.
 
     Args:
         study: what was fitted.
@@ -74,4 +74,4 @@ def _per_output(study: Study, values: np.ndarray) -> str:
 def _time(manifest: Manifest) -> str:
     facts = manifest.facts
     parts = [f"{what} {facts[key]:.1f} s" for what, key in PHASES if key in facts]
-    return ", ".join([*parts, f"{manifest.wall_seconds:.1f} s in all until this report"])
+    return ", ".join([*parts, f"{manifest.wall_seconds:.1f} s in total until this report"])

@@ -1,4 +1,4 @@
-"""The report's table of what a controller was asked for."""
+"""The report's table of a control task."""
 
 from typing import Any
 
@@ -6,21 +6,21 @@ from simpel_cli.control.assignment import Assignment
 
 
 def task_table(asked: Assignment) -> dict[str, Any]:
-    """Return the report's table of what was asked for."""
+    """Return the report's table of the task."""
     task, source = asked.task, asked.source
     begins = {q.name: task.initial.get(q.name, 0.0) for q in source.states}
     rows = [
-        ("reward of a step", task.reward),
+        ("reward per step", task.reward),
         *((f"... {name}", str(text)) for name, text in task.names.items()),
         ("horizon", f"{task.horizon} steps of {source.dt:.4g} s"),
-        ("begins at", ", ".join(f"{name} {value}" for name, value in begins.items())),
+        ("initial state", ", ".join(f"{name} {value}" for name, value in begins.items())),
         ("commands", ", ".join(
             f"{q.name} {low:g} to {high:g} {q.unit}".rstrip()
             for q, low, high in zip(asked.encoding.inputs, asked.goal.low, asked.goal.high, strict=True)
         )),
     ]  # fmt: skip
     if task.success:
-        rows.append(("succeeded", f"{task.success} in each of the last {task.settled} steps"))
+        rows.append(("success", f"{task.success} in each of the last {task.settled} steps"))
     if task.stop:
-        rows.append(("ends where", task.stop))
+        rows.append(("episode ends if", task.stop))
     return {"title": "Task", "head": (), "rows": rows, "text": True}

@@ -1,1 +1,1 @@
-"""One fit as a whole: opened, prepared, its prior checked, trained, judged; the loop closed with a corrected simulator."""
+"""One fit as a whole: opened, prepared, its prior checked, trained, tested; and fits with a corrected simulator."""

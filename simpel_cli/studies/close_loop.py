@@ -1,4 +1,4 @@
-"""Closing the loop: SimPEL with the simulator as it was and with the corrected one as prior, on the same few transitions."""
+"""SimPEL with the declared and with the corrected simulator as prior, fitted to the same few transitions."""
 
 from pathlib import Path
 from time import perf_counter
@@ -19,7 +19,7 @@ from simulators.model import Model
 
 SIZES = (20, 50)  # training transitions
 SEEDS = 5
-SHOWN = ("nll", "nrmse")  # joint, beside the free runs
+SHOWN = ("nll", "nrmse")  # joint, beside the errors ahead
 
 Summary = dict[str, dict[str, dict[str, list[float]]]]
 
@@ -30,7 +30,7 @@ def past_inputs(source: Source) -> int:
 
 
 def close(declared: Declared, corrected: Declared, directory: Path, data_folder: Path, terminal: Terminal) -> Summary:
-    """Fit SimPEL with both simulators and judge both on the test episodes; writes `metrics.parquet`.
+    """Fit SimPEL with both simulators and test both on the test episodes; writes `metrics.parquet`.
 
     Both get the same transitions, past inputs, method and seeds.
 
@@ -85,11 +85,11 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, list[float]]:
 
 
 def _compared(old: dict[str, list[float]], new: dict[str, list[float]]) -> str:
-    """Say before and after in one line: NLL, and the longest free run."""
+    """Return before and after in one line: NLL, and the error at the longest horizon."""
     longest = [k for k in old if k.startswith("free_run_rmse@")]
     last = max((float(k.split("@")[1].split("s ")[0]) for k in longest), default=0.0)
     shown = ["nll", *(k for k in longest if float(k.split("@")[1].split("s ")[0]) == last)]
-    names = {"nll": "NLL"} | {k: k.replace("free_run_rmse@", "free run ") for k in longest}
+    names = {"nll": "test NLL"} | {k: k.replace("free_run_rmse@", "RMSE after ") for k in longest}
     return ", ".join(f"{names[k]} {_spread(old[k])} -> {_spread(new[k])}" for k in shown if k in new)
 
 

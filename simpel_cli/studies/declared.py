@@ -59,7 +59,7 @@ class Declared(NamedTuple):
 
     @property
     def evaluation(self) -> Evaluation:
-        """How a posterior is judged."""
+        """How a posterior is tested."""
         return self.groups.get("evaluation") or Evaluation()
 
     @property

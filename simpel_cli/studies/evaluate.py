@@ -1,4 +1,4 @@
-"""A posterior rebuilt from configuration and checkpoint, and judged: on its own test split, or on other measurements."""
+"""A posterior rebuilt from configuration and checkpoint, and tested: on its own test split, or on other measurements."""
 
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,9 @@ OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others be
 
 
 def evaluate(job: Job, screen: Screen) -> None:
-    """Judge the run `run_dir` on its own test split, or on all of the measurements that `data=` names.
+    """Test the run `run_dir` on its own test split, or on all of the measurements that `data=` names.
 
-    Of a file that the run was trained on, only its own test split is judged. Training data, seeds and method are the
+    Of a file that the run was trained on, only its own test split is used. Training data, seeds and method are the
     run's; `data=`, `evaluation=` and `run.quiet` may differ.
     """
     run = Path(job.config["run_dir"])
@@ -47,7 +47,7 @@ def evaluate(job: Job, screen: Screen) -> None:
     if own.get("data") and not own["choices"].get("data"):
         key = next(iter(own["data"]))
         raise ConfigError(
-            f"data.{key}: evaluate keeps the run's own data; for another data.{key} fit again. To judge on other "
+            f"data.{key}: evaluate keeps the run's own data; for another data.{key} fit again. To test on other "
             f"measurements, name them: data=NAME. (evaluate takes data=NAME and its keys, evaluation.horizon, {settings})"
         )
     directory, beside = job.directory, {"judged_on": own["data"]} if own.get("data") else {}
@@ -78,13 +78,13 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     declared = study.declared._replace(config=study.declared.config | {"choices": choices})
     other = _opened_whole(declared, data, job.data_folder)
     if other.system.encoding != study.system.encoding:
-        raise ConfigError("data: the run was fitted to other measured quantities than these data have.")
+        raise ConfigError("data: these data have other measured quantities than the run was fitted to.")
     recording = other.recording
     known = (record.get("inputs_sha256") or {}).values()
     if any(sha256(file) in known for file in recording.files if file.suffix not in CARDS):
-        return study  # another split of the run's own file would judge the model on what it was trained on
+        return study  # another split of the run's own file would test the model on its training data
     recording = recording._replace(train=(), test=(*recording.train, *recording.test))
-    said = f"everything is judged ({held_out_summary(recording)}): the fit was not trained on this file"
+    said = f"all rows are test data ({held_out_summary(recording)}): the fit was not trained on this file"
     checks = tuple(Check("split", True, said) if check.name == "split" else check for check in recording.checks)
     return other._replace(recording=recording._replace(checks=checks))
 

@@ -1,4 +1,4 @@
-"""A fit as a whole: opened, its prior checked, trained, judged, shown; or gone on with where it was stopped."""
+"""A fit as a whole: opened, its prior checked, trained, tested, reported; or resumed where it was stopped."""
 
 import time
 from pathlib import Path
@@ -25,7 +25,7 @@ from simpel_cli.studies.training import checkpointed_state, train
 
 
 class Learned(NamedTuple):
-    """What a fit came to: the state of every seed's posterior (leaves (seeds, ...)), and what it is bound to."""
+    """The result of a fit: the state of every seed's posterior (leaves (seeds, ...)), and what it is bound to."""
 
     study: Study
     fitted: Fitted
@@ -103,7 +103,7 @@ def _run(study: Study, manifest: Manifest, screen: Screen, *, resume: bool, show
         if not study.recording.test:
             metrics.close()
             terminal.line(
-                f"nothing was kept to judge on; simpel evaluate {typed(directory)} data=NAME judges on other measurements"
+                f"there are no test data; simpel evaluate {typed(directory)} data=NAME tests on other measurements"
             )
             return Learned(study, fitted, state)
         judged = judge(study, posteriors(study, fitted, state), fitted.target_std, directory, study.method.steps)

@@ -1,4 +1,4 @@
-"""Judge posteriors on held-out episodes and write what people look at: Parquet, figures, report."""
+"""Test posteriors on held-out episodes and write the tables of the results."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.runs.files import write_table
 from simpel_cli.studies.open import Study, refuse_untested
 
-MOST_RUNS = 100  # free runs whose course is kept
+MOST_RUNS = 100  # free runs that are kept in full
 
 
 class Judged(NamedTuple):
@@ -31,7 +31,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     Writes `predictions.parquet`, `calibration.parquet`, `horizon.parquet` and `trajectories.parquet` into `directory`.
 
     Args:
-        study: what was fitted, with the measurements to judge it on.
+        study: what was fitted, with the measurements to test it on.
         posteriors: one per seed.
         target_std: spread of the targets over the simulator's ranges, data units, shape (dy,).
         directory: of the run.
@@ -131,7 +131,7 @@ def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.n
 
 
 def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, np.ndarray]:
-    """Root mean square error of free runs, and the spread that the posterior claims, by horizon and state."""
+    """Root mean square error of free runs, and the spread that the posterior predicts, by horizon and state."""
     rmse = np.sqrt((run.error**2).mean(axis=0))
     claimed = np.sqrt((run.std**2).mean(axis=0))
     steps, ds = rmse.shape

@@ -50,7 +50,7 @@ class Study(NamedTuple):
 
     @property
     def evaluation(self) -> Evaluation:
-        """How a posterior is judged."""
+        """How a posterior is tested."""
         return self.declared.evaluation
 
     @property
@@ -85,7 +85,7 @@ def open_study(declared: Declared, data_folder: Path, *, whole: bool = True) -> 
     """
     device = configure(declared.settings)
     measurements, source = declared.measurements, declared.source
-    # the split does not depend on run.seed: every seed of a sweep is judged on the same episodes
+    # the split does not depend on run.seed: every seed of a sweep is tested on the same episodes
     recording = read(measurements, source, data_folder, 0, whole=whole)
     return Study(declared, device, system_of(source, recording.outputs, measurements.stack_actions), recording)
 
@@ -98,6 +98,6 @@ def refuse_untested(recording: Recording) -> None:
     """
     if not recording.test:
         raise DataError(
-            "nothing is kept to judge on (data.split.test_fraction is 0, or there are no measurements). Keep some, or name "
+            "there are no test data (data.split.test_fraction is 0, or there are no measurements). Keep some, or name "
             "others: simpel evaluate RUN_DIR data=NAME."
         )

@@ -16,7 +16,7 @@ from simpel_cli.inference.system import normaliser_of
 from simpel_cli.runs.settings import stream
 from simpel_cli.studies.open import Study
 
-STRETCH = 500  # steps between two looks of the host; the draws of the prior are refreshed as often
+STRETCH = 500  # steps per call of the compiled program; the draws of the prior are refreshed as often
 
 
 class Fitted(NamedTuple):

@@ -1,4 +1,4 @@
-"""What a study shows while it runs. Studies call it; `reporting.fit.SCREEN` is the one for people."""
+"""The output of a study while it runs; `reporting.fit.SCREEN` prints to the terminal."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,8 +9,8 @@ class Screen(NamedTuple):
 
     Args:
         describe: (terminal, study, fitted, checked prior or None), before training.
-        describe_evaluation: (terminal, directory of the fit, step, study of the fit, study that is judged), before judging.
-        publish: (terminal, study of the fit, fitted, study that is judged, judged, manifest), at the end: prints the results,
+        describe_evaluation: (terminal, directory of the fit, step, study of the fit, study that is tested), before the test.
+        publish: (terminal, study of the fit, fitted, study that is tested, results, manifest), at the end: prints the results,
             draws the figures, writes the report.
     """
 

@@ -177,7 +177,7 @@ class TestFit:
         assert f"omega {start['std']:.3g} rad/s" in run_table["learned noise"]
         assert run_table["device"] == f"{record['device']}, float32"
         assert f"training {record['train_seconds']:.1f} s" in run_table["time"]
-        seconds = re.search(r"([\d.]+) s in all", run_table["time"])
+        seconds = re.search(r"([\d.]+) s in total", run_table["time"])
         assert seconds is not None
         assert record["train_seconds"] < float(seconds[1]) <= record["wall_seconds"] + 0.05
         for name in ("simpel", "jax", "numpy"):
@@ -265,7 +265,7 @@ class TestEvaluate:
         assert len(judged) == 4 * 29 * 3  # every transition of every episode, whatever the file calls train or test
         assert {row["episode"] for row in judged} == {"0", "1", "2", "3"}
         said = (tmp_path / "e" / "run.log").read_text()
-        assert re.search(r"measurements.parquet   all of it, 4 episodes, new to the fit   checks \d+ ok", said)
+        assert re.search(r"measurements.parquet   all of it, 4 episodes, not used in the fit   checks \d+ ok", said)
         assert "test (4 episodes)" in said
         assert "the fit was not trained on this file" in (tmp_path / "e" / "report.html").read_text()
 
@@ -278,7 +278,7 @@ class TestEvaluate:
         run(tmp_path, "evaluate", fitted, "--config-dir", "my", "data=one", "hydra.run.dir=e", "run.quiet=true")
         judged = pq.read_table(tmp_path / "e" / "predictions.parquet")
         assert judged.num_rows == (len(table) // 12 - 2) * 3  # the one step across the cut is lost
-        assert "all of it, 1 episode in 2 segments, new to the fit" in (tmp_path / "e" / "run.log").read_text()
+        assert "all of it, 1 episode in 2 segments, not used in the fit" in (tmp_path / "e" / "run.log").read_text()
 
     def test_the_files_own_training_data_are_not_judged(self, fitted: Path, tmp_path: Path) -> None:
         words = ("data=pendulum", "data.split={test_fraction:0.9,by:episode}", "run.quiet=true")
@@ -327,7 +327,7 @@ class TestSimulate:
         assert "resampling 10 rows)" in said
         assert re.search(r"  value +NLL", said)
         assert "one step" not in said.lower()
-        assert "one step" not in (tmp_path / "f" / "report.html").read_text().split("<h2>Go on")[0].lower()
+        assert "one step" not in (tmp_path / "f" / "report.html").read_text().split("<h2>Next commands")[0].lower()
         assert set(pq.read_table(tmp_path / "f" / "predictions.parquet")["kind"].to_pylist()) == {"value"}
 
 

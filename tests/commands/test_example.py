@@ -24,7 +24,7 @@ def test_it_is_whole_and_nothing_is_overwritten(my: Path) -> None:
     assert {p.relative_to(my) for p in my.rglob("*") if p.is_file()} == files
     (my / "sim" / "cart.yaml").write_text("mine")
     again = simpel(my.parent, "example", "my")
-    assert (again.code, "my: is there and not empty" in again.err) == (2, True)
+    assert (again.code, "my: exists and is not empty" in again.err) == (2, True)
     assert (my / "sim" / "cart.yaml").read_text() == "mine"
 
 

@@ -89,7 +89,7 @@ def test_fit_says_what_it_understood_and_what_comes_next(folder: Path, fitted: t
     run, out = fitted
     assert run.is_relative_to(folder)
     assert "run.csv   7 train / 2 test episodes, 30 transitions used, dt 0.05 s" in out
-    assert "cart   uncertain: m k" in out
+    assert "cart   uncertain parameters: m k" in out
     assert re.search(r"^next +simpel evaluate ", out, re.M)
     found = metrics(run)
     assert {row["n_train"] for row in found} == {30}

@@ -166,12 +166,12 @@ CASES = [
     own("short line", DATA, "run.csv has 5 columns, but record 182", measurements=csv(swing()) + "1,2,3\n"),
     own("decimal commas", DATA, "column 't' of run.csv should hold numbers, but line 2 has '0,0'", "write 0.0",
         "sep=';', decimal=','", measurements=csv(swing()).replace(",", ";").replace(".", ",")),
-    own("another sampling time", DATA, "the rows are 0.1 s apart, but simulator 'cart' steps 0.05 s", "data.resample: 0.05",
+    own("another sampling time", DATA, "the rows are 0.1 s apart, but simulator 'cart' has dt = 0.05 s", "data.resample: 0.05",
         measurements=csv(swing(dt=0.1))),
     own("time in ms", DATA, "The time looks like ms", measurements=csv(swing(dt=50))),
     own("one row per episode", DATA, "too few rows: none of 6 rows follows another", measurements=csv(swing(rows=1))),
     own("one episode", DATA, "there is one episode only", "by: time", measurements=csv(swing(episodes=1))),
-    own("nothing moves", DATA, "nothing moves: s, v are constant",
+    own("nothing moves", DATA, "nothing changes: s, v are constant",
         measurements=csv([[*row[:2], 1, 1, row[4]] for row in swing()])),
     own("more than there is", DATA, "data.n_train: 100000 training transitions are asked for", extra=("data.n_train=100000",)),
     own("no transitions", CONFIG, "data.n_train: -1 is not allowed", extra=("data.n_train=-1",)),
@@ -246,7 +246,7 @@ def test_rows_with_nan_are_dropped_and_counted(tmp_path: Path) -> None:
     rig(tmp_path, measurements=change(40, 2, "nan"))
     result = simpel(tmp_path, *OWN[:-1], "run.quiet=false")
     assert result.code == 0, result.err
-    assert "1 of 180 rows dropped (NaN, inf or nothing in pos)" in result.out
+    assert "1 of 180 rows dropped (NaN, inf or empty in pos)" in result.out
 
 
 def test_a_failed_start_leaves_its_directory_free(tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ class TestOfARun:
         key = word.lstrip("+").partition("=")[0]
         assert result.code == CONFIG
         assert result.err.startswith(f"error: {key}: evaluate keeps the run's own data; for another {key} fit again. ")
-        assert "To judge on other measurements, name them: data=NAME." in result.err
+        assert "To test on other measurements, name them: data=NAME." in result.err
         assert "data=NAME and its keys, evaluation.horizon, run.quiet, run.device, run.cache)" in result.err
         assert result.err.count("\n") == 1
 

@@ -423,7 +423,7 @@ def test_the_run_holds_what_is_promised(driven: Path) -> None:
     assert learned == [0, 12, 24]
     judged = simpel(driven, "evaluate", "rounds/002/posterior", "data=pendulum_swing_up", "hydra.run.dir=judged")
     assert judged.code == 0, judged.err
-    assert "new to the fit" in judged.out
+    assert "not used in the fit" in judged.out
     assert by["nll_before", 2] < by["nll_before", 0]  # what was measured helps
 
 
@@ -518,7 +518,7 @@ def test_a_run_that_was_damaged(driven: Path, tmp_path: Path, damage: Any, messa
         (("online.episodes=0",), "online.episodes: got 0; it must be at least 1"),
         (("online.warmstart=true",), "online.warmstart: no such key"),
         (("world=folder:/proc/rig",), "world: cannot write to"),
-        (("data.n_train=5",), "data.n_train=5: rl-online learns from episodes of its own"),
+        (("data.n_train=5",), "data.n_train=5: rl-online learns from its own episodes"),
         (("data.noise_std.q=1",), "data.noise_std.q: the simulator has no such quantity (it has: phi, omega)"),
         (
             ("sim@truth=pendulum_high_fidelity", "sim.dt=0.1"),
@@ -563,7 +563,7 @@ def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
     thread = threading.Thread(target=rig, daemon=True)
     thread.start()
     result = simpel(tmp_path, *words, "online.episodes=2", "online.wait=1.5", "hydra.run.dir=run")
-    assert "refused: episode_000.parquet: nothing moves" in result.out
+    assert "refused: episode_000.parquet: nothing changes" in result.out
     assert "episode_001.parquet did not come within 1.5 s" in result.err  # the first was taken, the second asked for
     assert pq.read_table(tmp_path / "run" / "episodes" / "000.parquet").num_rows == 13
     again = simpel(tmp_path, *words, "online.episodes=2", "policy.steps=8000", "hydra.run.dir=run")

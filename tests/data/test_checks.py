@@ -63,7 +63,7 @@ def test_rows_with_nan_are_dropped_and_never_bridged(tmp_path: Path) -> None:
     columns["a"][10], columns["u"][50] = np.nan, np.inf
     recording = read_columns(tmp_path, columns, max_gap=1.0)  # a wide gap is allowed, a dropped row is still a cut
     assert not check(recording, "finite").ok
-    assert "2 of 80 rows dropped (NaN, inf or nothing in a, u)" in check(recording, "finite").detail
+    assert "2 of 80 rows dropped (NaN, inf or empty in a, u)" in check(recording, "finite").detail
     episodes = (*recording.train, *recording.test)
     assert sorted(len(e.time) for e in episodes) == [10, 10, 29, 29]
     assert {e.name for e in episodes} == {"0", "0/2", "1", "1/2"}
@@ -77,7 +77,9 @@ def test_a_last_row_without_command_still_ends_a_transition(tmp_path: Path) -> N
     pairs = transitions(recording.train, 0)
     assert len(pairs.row) == 39
     assert np.isfinite(pairs.inputs).all()
-    assert check(recording, "finite") == Check("finite", True, "all 80 rows; 2 episodes end without a command")
+    assert check(recording, "finite") == Check(
+        "finite", True, "all 80 rows are finite; 2 episodes end without a command"
+    )
 
 
 def test_gaps_cut_an_episode(tmp_path: Path) -> None:
@@ -106,14 +108,14 @@ def test_time_must_increase(tmp_path: Path, shift: float, fault: str) -> None:
 def test_dt_must_be_the_simulators(tmp_path: Path) -> None:
     columns = table()
     columns["t"] *= 0.5
-    with pytest.raises(DataError, match=r"0.05 s apart.*steps 0.1 s.*data.resample: 0.1, or set sim.dt: 0.05"):
+    with pytest.raises(DataError, match=r"0.05 s apart.*has dt = 0.1 s.*data.resample: 0.1, or set sim.dt: 0.05"):
         read_columns(tmp_path, columns)
     with pytest.raises(ConfigError, match=r"data.resample: 0.2 s.*data.resample: 0.1, or sim.dt: 0.2"):
         read_columns(tmp_path, columns, resample=0.2)
     columns["t"] *= 2000
     with pytest.raises(DataError, match="looks like ms"):
         read_columns(tmp_path, columns)
-    with pytest.raises(DataError, match=r"100 s apart: resampling to 0.1 s would invent.*looks like ms"):
+    with pytest.raises(DataError, match=r"100 s apart: resampling to 0.1 s would interpolate.*looks like ms"):
         read_columns(tmp_path, columns, resample=0.1)
 
 
@@ -122,7 +124,7 @@ def test_constant_columns(tmp_path: Path) -> None:
     columns["u"][:] = 0.5
     assert check(read_columns(tmp_path, columns), "constant") == Check("constant", False, "constant: u")
     columns["a"][:] = columns["w"][:] = 0.0
-    with pytest.raises(DataError, match="nothing moves: a, w, u are constant over all 80 rows"):
+    with pytest.raises(DataError, match="nothing changes: a, w, u are constant over all 80 rows"):
         read_columns(tmp_path, columns)
 
 
@@ -140,7 +142,7 @@ def test_values_outside_the_range_are_counted_and_angles_compared_modulo_a_turn(
     columns["w"][[3, 4, 60]] = 9.0
     columns["a"] += 4 * np.pi
     detail = check(read_columns(tmp_path, columns), "ranges").detail
-    assert detail == "w 3 of 80 outside [-5, 5] rad/s"
+    assert detail == "w: 3 of 80 values outside [-5, 5] rad/s"
 
 
 def test_wrapped_and_running_angles_give_the_same_motion(tmp_path: Path) -> None:
@@ -182,7 +184,7 @@ def test_the_card_is_among_the_files(tmp_path: Path) -> None:
 def test_spellings_of_a_unit(tmp_path: Path) -> None:
     recording = read_columns(tmp_path, table(), {"u": "N*m", "w": "radians / s"})
     assert check(recording, "units").detail.startswith("2 of 3")
-    with pytest.raises(DataError, match="time is read in s"):
+    with pytest.raises(DataError, match="but time is read in s"):
         read_columns(tmp_path, table(), {"t": "ms"})
 
 
@@ -283,18 +285,21 @@ def test_a_turn_rate_in_degrees_is_suspected_and_many_turns_are_not(tmp_path: Pa
     columns = table(rows=200)
     columns["w"] = np.degrees(columns["w"])
     assert (
-        "w 380 of 400 outside [-5, 5] rad/s: is it in degrees?"
+        "w: 380 of 400 values outside [-5, 5] rad/s: is it in degrees?"
         in check(read_columns(tmp_path, columns), "ranges").detail
     )
     columns["a"], columns["w"] = 4 * columns["t"], np.full(400, 4.0) + 0.1 * np.sin(columns["t"])  # 12 turns in 20 s
     assert check(read_columns(tmp_path, columns), "ranges").ok
     columns["u"][:] = 5 + np.sin(columns["t"])
-    assert "outside [-1, 1] N m: compare the unit" in check(read_columns(tmp_path, columns), "ranges").detail
+    assert "outside [-1, 1] N m: check the unit" in check(read_columns(tmp_path, columns), "ranges").detail
 
 
 def test_units_that_nobody_declares(tmp_path: Path) -> None:
     assert check(read_columns(tmp_path, table()), "units").detail == (
-        "no column declares a unit: all are read in the simulator's"
+        "no column declares a unit: the simulator's units are assumed"
     )
     some = check(read_columns(tmp_path, table(), {"a": "rad"}), "units").detail
-    assert some == "1 of 3 columns declare a unit, the same as the simulator's; the others are read in its units"
+    assert (
+        some
+        == "1 of 3 columns declare a unit, the same as the simulator's; the simulator's units are assumed for the others"
+    )

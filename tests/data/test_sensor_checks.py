@@ -90,7 +90,10 @@ def test_held_rows_show_in_a_fit_of_the_file(tmp_path: Path) -> None:
     a, w = motion(0.02 * np.arange(300))
     half = np.arange(300) // 2 * 2
     recording = measured(tmp_path, [a, a], [w[half], w[half]])
-    assert "w repeats its last value in 43% of the rows while it moves, 2 at a time" in check(recording, "stale").detail
+    assert (
+        "w repeats its last value in 43% of the rows while the quantity changes, 2 rows at a time"
+        in check(recording, "stale").detail
+    )
     assert check(measured(tmp_path, [a, a], [w, w]), "stale").ok
 
 
@@ -116,7 +119,7 @@ def test_quantisation_is_reported_where_it_exceeds_the_noise() -> None:
 
     found = quantisation({"a": [rounded(0.0, 0.02)]}, {"a": "rad"})
     assert not found.ok
-    assert "a comes in steps of 0.02 rad" in found.detail
+    assert "a is quantised in steps of 0.02 rad" in found.detail
     assert quantisation({"a": [rounded(0.02, 0.02)]}, {}).ok  # noise spreads it over the steps
     assert quantisation({"a": [rounded(0.0, 1e-5)]}, {}).ok  # too fine to matter
     assert quantisation({"a": [motion(t)[0]]}, {}).ok
@@ -125,7 +128,7 @@ def test_quantisation_is_reported_where_it_exceeds_the_noise() -> None:
 def test_jitter() -> None:
     rng = np.random.default_rng(0)
     even = 0.1 * np.arange(200)
-    assert jitter([even, even + 5], 0.1, 0.1) == Check("jitter", True, "every step is dt")
+    assert jitter([even, even + 5], 0.1, 0.1) == Check("jitter", True, "all time steps equal dt")
     assert jitter([even + rng.uniform(-5e-4, 5e-4, 200)], 0.1, 0.1).ok
     uneven = np.cumsum(rng.uniform(0.05, 0.14, 200))
     found = jitter([uneven], 0.095, 0.1)

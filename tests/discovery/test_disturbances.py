@@ -138,7 +138,7 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
     remainder = said(levels, found)
     assert (remainder["depends_on"], remainder["period"], remainder["unit"]) == (["time"], found.period, "m/s^2")
     assert f"with a period of about {found.period:.3g} s" in remainder["description"]
-    assert "as u does" not in remainder["description"]
+    assert "that of u" not in remainder["description"]
     # an input that swings in the same time is named
     windows = levels.search.plan.windows
     wave = np.sin(2 * np.pi * DT / found.period * np.arange(windows.u.shape[1]))[None, :, None]
@@ -147,7 +147,7 @@ def test_a_force_that_swings_is_found_with_its_period(shaken: float) -> None:
         levels.search, select_nothing(levels), found, levels.assessor(levels.chosen.optimum.z, windows)
     )
     assert alike is not None
-    assert alike["description"].endswith("as u does, of which it may be a function")
+    assert alike["description"].endswith("the same as that of u: possibly a function of the input")
 
 
 @pytest.mark.parametrize("correlation", [0.3, 1.0])

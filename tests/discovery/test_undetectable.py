@@ -16,14 +16,14 @@ def test_test_episodes_that_surprise_are_told_whatever_the_verdict() -> None:
         text = caveats(
             FOUND | {"verdict": verdict, "error": {"surprise": {"s": 1.0, "v": SURPRISING + 0.9, "w": float("nan")}}}
         )
-        assert "in v are 2.4 times what the model expects" in text
+        assert "in v are 2.4 times as large as the model predicts" in text
     assert caveats(FOUND | {"error": {"surprise": {"s": float("nan")}}}) == ""
 
 
 def test_what_was_not_tested_and_faults_are_told_where_nothing_was_found() -> None:
-    entry = {"name": "end_stop", "acts_on": "v", "reason": "these data would look the same with any of its sizes"}
+    entry = {"name": "end_stop", "acts_on": "v", "reason": "its size has no visible influence on these data"}
     faults = [{"check": "kinematics", "ok": False}, {"check": "gaps", "ok": False}]
     text = caveats(FOUND | {"not_tested": [entry], "data_checks": faults})
     assert "Not tested by these data: end stop on v" in text
-    assert text.endswith("The data have faults that come first: kinematics.")
+    assert text.endswith("Correct these faults of the data first: kinematics.")
     assert caveats(FOUND | {"verdict": "effect", "not_tested": [entry], "data_checks": faults}) == ""

@@ -270,7 +270,7 @@ def test_one_path_goes_through_what_is_free_of_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("most", "words"), [(16, "40 transitions used (of which the method takes 16, evenly"), (40, "40 transitions used,")]
+    ("most", "words"), [(16, "40 transitions used (the method takes 16 of them, evenly"), (40, "40 transitions used,")]
 )
 def test_what_is_left_out_is_said(most: int, words: str) -> None:
     source = SimpleNamespace(states=("phi",), dt=0.05)

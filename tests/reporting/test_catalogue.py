@@ -36,7 +36,7 @@ def test_every_effect_is_listed_and_can_be_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("sims", "crat"), "sim: got crat; there is no such one. Did you mean cart? `simpel sims` lists them."),
+        (("sims", "crat"), "sim: got crat; there is no sim of that name. Did you mean cart? `simpel sims` lists them."),
         (("effects", "colomb_friction"), "Did you mean coulomb_friction?"),
         (("sims", "cart"), "sim.dynamics.w: is no state"),
     ],

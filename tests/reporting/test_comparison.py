@@ -99,7 +99,7 @@ def test_report_of_parquet_files(runs: Path, tmp_path: Path) -> None:
     # again, over itself, against the other; a sweep's table alone says the same
     result = simpel(tmp_path, "report", "fits", "--baseline", "fsvgd", "--out", "there")
     assert result.code == 0
-    assert "less fsvgd" in (tmp_path / "there" / "report.html").read_text()
+    assert "minus fsvgd" in (tmp_path / "there" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -107,10 +107,10 @@ def test_report_of_parquet_files(runs: Path, tmp_path: Path) -> None:
     [
         (("report", "nowhere"), "report: nowhere is no directory."),
         (("report", "."), "holds no runs"),
-        (("report", "fits/broken"), "of 1 runs none is done with metrics that can be read (1 failed)"),
+        (("report", "fits/broken"), "none of the 1 runs is complete with readable metrics (1 failed)"),
         (
             ("report", "fits", "--baseline", "simple"),
-            "--baseline: got simple, which no run is of. Did you mean simpel?",
+            "--baseline: got simple; no run has this method. Did you mean simpel?",
         ),
         (("report", "fits", "--out", "file"), "--out: cannot write to file"),
         (("report", "fits", "--out", "fits/broken"), "--out: fits/broken is the directory of a run"),
@@ -156,7 +156,7 @@ def test_a_damaged_run_costs_itself_only(runs: Path, tmp_path: Path) -> None:
     assert result.code == 0
     page = (runs / "report.html").read_text()
     assert "done, metrics not readable" in page
-    assert "Over 2 to 3 seeds." in page
+    assert "Mean over 2 to 3 seeds." in page
 
 
 LOOK = """<script>addEventListener("load", () => {

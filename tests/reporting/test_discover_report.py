@@ -41,16 +41,18 @@ def test_report(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -
     assert page.index(found["summary"]) < page.index("<h2>")  # opens with the sentence
     order = headings(page)
     wanted = {
-        "effect": ["Error before and after", "The equation before and after", "What was added", "The latent force",
-                   "What the effects explain", "Free runs", "Evidence of every candidate"],
-        "none": ["Error of the calibrated simulator", "The equation", "The latent force", "Free runs"],
+        "effect": ["Test error before and after", "The equation before and after", "Effects that were added",
+                   "Latent force (model error)", "Fitted effects and latent force", "Simulation of a test episode",
+                   "Evidence of every candidate"],
+        "none": ["Test error of the calibrated simulator", "The equation", "Latent force (model error)",
+                 "Simulation of a test episode"],
     }  # fmt: skip
     head = wanted["effect" if found["effects"] else "none"]
     assert order[: len(head)] == head
-    tail = ["What was not found, and how small it must be", "What these data tested", "Data checks"]
+    tail = ["Effects that were not found, and their largest possible size", "Range of the training data", "Data checks"]
     tail += ["Next experiment"] if kind == "ambiguous" else []
-    assert order[-len(tail) - 2 :] == [*tail, "Go on", "Configuration"]
-    assert ("What is left unexplained" in order) == (kind == "unexplained")
+    assert order[-len(tail) - 2 :] == [*tail, "Next commands", "Configuration"]
+    assert ("Unexplained model error" in order) == (kind == "unexplained")
     assert ("viscous friction" in page) == (kind == "ambiguous")
     printed = capsys.readouterr().out
     assert str(path) in printed
@@ -67,13 +69,13 @@ def test_without_a_report_the_verdict_is_named(tmp_path: Path, capsys: pytest.Ca
     assert not list(folder.glob("*.html")) + list(folder.glob("*.png"))
 
 
-def test_a_hopeless_fit_has_no_size(tmp_path: Path) -> None:
+def test_a_fit_that_was_stopped_early_has_no_size(tmp_path: Path) -> None:
     """The spread of a fit that never came to rest says nothing about the size of its effect."""
     page = publish(Terminal(True), searches.verdict("none"), searches.directory(tmp_path, "none"), searches.CONFIG)
     text = page.read_text()
     assert "0.021 1/rad" in text
     assert "1e-06" not in text
-    assert "no size can be stated: end stop on omega" in text
+    assert "their size is not known: end stop on omega" in text
 
 
 def test_new_terms_are_marked() -> None:
@@ -119,7 +121,7 @@ def test_commands_fit_the_verdict() -> None:
         return next_commands(searches.verdict(kind), Path("run"), searches.CONFIG)
 
     assert lines("effect")[0] == "simpel fit --config-dir run/conf sim=rotor_with_coulomb_friction data=bench"
-    assert lines("none") == ["simpel fit experiment=rotor          # with the simulator as it is"]
+    assert lines("none") == ["simpel fit experiment=rotor          # with the declared simulator"]
     assert any("effect=[all,my_effect]" in line for line in lines("unexplained"))
 
 
@@ -170,27 +172,31 @@ def test_the_curve_runs_through_the_points(tmp_path: Path) -> None:
     )
     axis = figure.axes[0]
     lines = {line.get_label(): line.get_xydata() for line in axis.lines}
-    seen, curve = lines["seen: mean and 95 % band"], lines["fitted effect"]
+    seen, curve = lines["latent force: mean and 95 % band"], lines["fitted effect"]
     away = seen[:, 1] - np.interp(seen[:, 0], curve[:, 0], curve[:, 1])
     assert np.abs(away[np.abs(seen[:, 0]) > 1]).max() < 0.15
     assert axis.get_xlabel() == "omega [rad/s]"
     assert axis.get_ylabel() == "force on omega [rad/s^2]"
 
 
-def test_evidence_shows_accepted_tied_and_hopeless(tmp_path: Path) -> None:
+def test_evidence_shows_accepted_tied_and_stopped_early(tmp_path: Path) -> None:
     searches.directory(tmp_path, "ambiguous")
     figure = discover_evidence.draw_evidence(searches.verdict("ambiguous"), tmp_path / "candidates.parquet")
     first = figure.axes[0]
     assert first.get_title(loc="left") == "step 1: + coulomb friction on omega"
     labels = [t.get_text() for t in first.get_yticklabels()]
-    assert labels[:3] == ["coulomb friction on omega", "stribeck friction on omega", "some function of omega on omega"]
+    assert labels[:3] == [
+        "coulomb friction on omega",
+        "stribeck friction on omega",
+        "unknown function of omega on omega",
+    ]
     widths = [bar.get_width() for bar in first.patches]
     assert max(widths) == 1738.0
     assert min(widths) == discover_evidence.LOWEST  # of -96595 nats
     texts = " ".join(t.get_text() for t in first.texts)
     assert "tie:" in texts
     assert "1 of them diverged" in texts
-    assert figure.axes[1].get_title(loc="left") == "step 2: nothing more is accepted"
+    assert figure.axes[1].get_title(loc="left") == "step 2: no further effect is accepted"
     assert "tie:" not in " ".join(t.get_text() for t in figure.axes[1].texts)
 
 
@@ -215,7 +221,7 @@ def test_priors_are_compared_size_by_size() -> None:
         "after": {"20": {"nll": [-9.26, -9.30, -9.09], "free_run_rmse@1s phi": [0.05, 0.04, 0.06]}},
     }
     section = prior_section({"as_prior": fits})
-    assert [row[:2] for row in section["rows"]] == [["20 transitions", "NLL"], ["20 transitions", "free run 1s phi"]]
+    assert [row[:2] for row in section["rows"]] == [["20 transitions", "NLL"], ["20 transitions", "RMSE after 1s phi"]]
     assert "-9.07" in section["rows"][0][2]
     assert "-9.26" in section["rows"][0][3]
     assert prior_section({}) == {}

@@ -112,8 +112,8 @@ def test_curves_of_many_outputs_can_be_told_apart(tmp_path: Path) -> None:
 def test_the_example_is_the_run_with_the_median_error(tmp_path: Path) -> None:
     path = trajectories(tmp_path, ("phi", "omega"), (0.1, 0.5, 0.2, 0.4, 0.3))
     figure = run._example(path)
-    assert "episode a from 4 s: the median error of 5 free runs" in figure._suptitle.get_text()
-    curve = next(line for line in figure.axes[0].lines if line.get_label() == "free run")
+    assert "test episode a from 4 s: median error of 5 runs" in figure._suptitle.get_text()
+    curve = next(line for line in figure.axes[0].lines if line.get_label() == "predicted")
     np.testing.assert_allclose(curve.get_ydata() - np.sin(np.arange(20) * 0.1), 0.3, rtol=1e-9)
     np.testing.assert_allclose(curve.get_xdata(), 4 + np.arange(20) * 0.1)
 

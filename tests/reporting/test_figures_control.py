@@ -56,7 +56,7 @@ def test_the_film_is_of_the_median_episode_and_stands_in_the_report(tmp_path: Pa
     assert len(rows) > 20
     assert abs(columns.mean() / width - 0.55) < 0.1
     section = figure(made[-1], "control/manoeuvre")
-    assert section["title"] == "The manoeuvre"
+    assert section["title"] == "Manoeuvre"
     assert section["width"] == width
     page = write_report(tmp_path / "report.html", title="t", lead="l", sections=[section], commands=[], config="a: 1")
     assert "data:image/gif;base64,R0lGOD" in page.read_text()

@@ -1,1 +1,1 @@
-"""What can be wrong with measurements: each check reports, and drops, cuts or refuses where it must."""
+"""Checks of the measurements: each reports, and drops rows, cuts episodes or refuses the data where necessary."""

@@ -12,8 +12,8 @@ from simpel_cli.data.tables.table import Table
 from simpel_cli.data.time_gaps import _bridge
 from simpel_cli.errors import ConfigError, DataError
 
-DT_TOLERANCE = 0.02  # relative; more is another sampling time, not jitter
-MAX_UPSAMPLING = 10.0  # more new rows than that between two measured ones are invented
+DT_TOLERANCE = 0.02  # relative; a larger difference is another sampling time, not jitter
+MAX_UPSAMPLING = 10.0  # new rows per measured row; more are refused
 
 
 def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
@@ -57,19 +57,19 @@ def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, fl
     if len(steps) == 0:
         raise DataError(f"too few rows: none of {len(rows.time)} rows follows another in the same episode.")
     dt = float(np.median(steps))
-    in_ms = " The time looks like ms: it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
+    in_ms = " The time looks like ms, but it is read in s." if math.isclose(dt, 1e3 * model.dt, rel_tol=0.02) else ""
     if config.resample is not None and dt > MAX_UPSAMPLING * model.dt:
         raise DataError(
-            f"the rows are {dt:.4g} s apart: resampling to {model.dt:g} s would invent most rows.{in_ms} "
+            f"the rows are {dt:.4g} s apart: resampling to {model.dt:g} s would interpolate most rows.{in_ms} "
             f"Record faster, or set sim.dt: {dt:.4g} and data.resample: null."
         )
     if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
         bridge, why = "", ""
         if irregular_share(steps, dt) > IRREGULAR_SHARE:
             bridge = _bridge(steps, 1.5 * max(dt, model.dt), " and ")
-            why = " (in the middle; they are irregular)"
+            why = " (median; the steps are irregular)"
         raise DataError(
-            f"the rows are {dt:.4g} s apart{why}, but simulator '{model.name}' steps {model.dt:g} s.{in_ms} "
-            f"Bring the data to it with data.resample: {model.dt:g}{bridge}, or set sim.dt: {dt:.4g}."
+            f"the rows are {dt:.4g} s apart{why}, but simulator '{model.name}' has dt = {model.dt:g} s.{in_ms} "
+            f"Resample the data with data.resample: {model.dt:g}{bridge}, or set sim.dt: {dt:.4g}."
         )
     return Check("sampling", True, f"dt {dt:.4g} s"), dt

@@ -5,7 +5,7 @@
 
 A value is left out if |d| is far beyond what is usual for the channel, and neither the rows before it nor those after it
 lead there. A jump, an impact, a stop or a switched input has two sides, and each of its values belongs to one of them.
-What a spike of an input may have caused is not judged.
+Values that a spike of an input may have caused are not tested.
 
 Reference: Hampel (1974), The influence curve and its role in robust estimation (median absolute deviation).
 """
@@ -22,7 +22,7 @@ SHARE = (0.5, 1.6)  # of d: what l and r of a lone value are, with noise
 TRUST = 2.0  # times what the same polynomial missed the two rows before by
 PASSES = 5  # one value can hide another one beside it
 EXTRAPOLATE = {1: (2.0, -1.0), 2: (3.0, -3.0, 1.0), 3: (4.0, -6.0, 4.0, -1.0)}  # weights of the nearest row first
-KICK = 0.2  # of the span of an input: a smaller spike of it is none
+KICK = 0.2  # of the span of an input: a smaller change is no spike
 
 
 def lone_values(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> list[np.ndarray]:

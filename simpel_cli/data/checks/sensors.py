@@ -1,6 +1,6 @@
 """Faults of sensors and clocks that can be seen in one column: held samples, coarse steps, irregular time stamps.
 
-They are looked for before any physics is blamed: a sensor that holds its value looks like a delay, a coarse one like
+They are tested before the search for effects: a sensor that holds its value resembles a delay, a coarse one
 friction. Every function takes contiguous pieces of a column and is free of the simulator.
 """
 
@@ -12,12 +12,10 @@ from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.data.recording import Check
 
 STALE_SHARE = 0.05  # of the rows; fewer repeats are what a quantised sensor gives
-JUMP = (
-    4.0  # smallest changes; a value that stands still between larger ones was held, since a fresh one would have moved
-)
+JUMP = 4.0  # smallest changes; a value that repeats between larger ones was held, since a new one would have changed
 SMALL = 0.25  # of the median change; a smaller one before a repeat is a motion that comes to rest
 LONG = 5.0  # times the usual length of a repeat
-FEW_RUNS = 5  # fewer repeats, or changes, tell nothing
+FEW_RUNS = 5  # fewer repeats, or changes, are not enough for a test
 COARSE = 2.5  # quanta per standard deviation of the noise: beyond, rounding is the larger error
 FEW_LEVELS = 1000  # over the whole span; finer steps are finer than anything that is learned
 GRID_SHARE = 0.98  # of the steps that are whole multiples of the quantum; the rest are angles that wrapped
@@ -39,11 +37,14 @@ def stale(signals: Mapping[str, Sequence[np.ndarray]]) -> Check:
         share, rows = held(pieces)
         if share > STALE_SHARE:
             found.append(
-                f"{name} repeats its last value in {share:.0%} of the rows while it moves, {rows:.0f} at a time"
+                f"{name} repeats its last value in {share:.0%} of the rows while the quantity changes, "
+                f"{rows:.0f} rows at a time"
             )
     if not found:
-        return Check("stale", True, "no sensor holds its value")
-    cure = "A slower sensor: set sim.dt and data.resample to its own rate; else take the repeated rows out"
+        return Check("stale", True, "no sensor repeats its last value while the quantity changes")
+    cure = (
+        "If the sensor is slower: set sim.dt and data.resample to its sampling time; otherwise remove the repeated rows"
+    )
     return Check("stale", False, f"{'; '.join(found)}. {cure}")
 
 
@@ -63,9 +64,11 @@ def quantisation(signals: Mapping[str, Sequence[np.ndarray]], units: Mapping[str
         span = max((float(np.ptp(piece)) for piece in pieces if len(piece)), default=0.0)
         sigma = third_difference_std(pieces)
         if np.isfinite(q) and np.isfinite(sigma) and q > COARSE * sigma and span < FEW_LEVELS * q:
-            what = f"{name} comes in steps of {q:.3g} {units.get(name, '')}".rstrip()
-            found.append(f"{what}, {span / q + 1:.0f} levels, coarser than its noise")
-    return Check("quantisation", not found, "; ".join(found) if found else "no sensor is coarser than its noise")
+            what = f"{name} is quantised in steps of {q:.3g} {units.get(name, '')}".rstrip()
+            found.append(f"{what} ({span / q + 1:.0f} levels), coarser than its noise")
+    return Check(
+        "quantisation", not found, "; ".join(found) if found else "no sensor is quantised more coarsely than its noise"
+    )
 
 
 def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None) -> Check:
@@ -74,14 +77,16 @@ def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None) -> Chec
     Args:
         times: of contiguous rows, each (T,) s.
         dt: of the data, s.
-        wanted: dt to resample to, s, for the advice; None: the data are resampled anyway, so that jitter does no harm.
+        wanted: dt to resample to, s, for the advice; None: the data are resampled anyway, which removes the jitter.
     """
     steps = np.concatenate([np.diff(time) for time in times]) if times else np.empty(0)
     share = irregular_share(steps, dt)
     if share == 0:
-        return Check("jitter", True, "every step is dt")
+        return Check("jitter", True, "all time steps equal dt")
     low, high = np.percentile(steps, [1, 99])
-    detail = f"{share:.1%} of the steps differ from dt by more than 2 % (1 to 99 % of them: {low:.3g} to {high:.3g} s)"
+    detail = (
+        f"{share:.1%} of the steps differ from dt by more than 2 % (1st to 99th percentile: {low:.3g} to {high:.3g} s)"
+    )
     if share <= IRREGULAR_SHARE:
         return Check("jitter", True, detail)
     cure = "resampled to equal steps" if wanted is None else f"data.resample: {wanted:.6g} makes them equal"

@@ -65,7 +65,7 @@ def check_units(
         of_column = of_card | sheet.units
         if config.time is not None and _canonical(of_column.get(config.time) or "s") != "s":
             raise DataError(
-                f"column '{config.time}' of {sheet.path.name} is in {of_column[config.time]}, time is read in s."
+                f"column '{config.time}' of {sheet.path.name} is in {of_column[config.time]}, but time is read in s."
             )
         for quantity in quantities:
             column = measured.get(quantity.name)
@@ -87,8 +87,8 @@ def period(quantity: Quantity) -> float | None:
 
 def _declared(compared: int, measured: int) -> str:
     if compared == 0:
-        return "no column declares a unit: all are read in the simulator's"
-    rest = "" if compared == measured else "; the others are read in its units"
+        return "no column declares a unit: the simulator's units are assumed"
+    rest = "" if compared == measured else "; the simulator's units are assumed for the others"
     return f"{compared} of {measured} columns declare a unit, the same as the simulator's{rest}"
 
 

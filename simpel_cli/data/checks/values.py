@@ -11,9 +11,9 @@ from simpel_cli.data.rows import Rows, follows
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
 
-MOSTLY = 0.5  # of the values outside a range: it is the unit, not the motion
+MOSTLY = 0.5  # share of the values outside a range, above which the unit is probably wrong
 SPIKE = 10.0  # widths of a range beyond it
-DEGREES = 361.0  # no angle in degrees within one turn reads more
+DEGREES = 361.0  # largest angle in degrees within one turn
 LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
 
 
@@ -43,17 +43,15 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
     dropped = len(keep) - int(keep.sum())
     if dropped == len(keep):
         empty = [name for name, column in zip(names, good.T, strict=True) if not column.any()]
-        which = (
-            f"'{empty[0]}' has no number at all" if empty else "every one has NaN, inf or nothing in one of its columns"
-        )
+        which = f"'{empty[0]}' has no numbers" if empty else "every row has NaN, inf or an empty cell"
         raise DataError(
-            f"no row is complete: {which}. If it was not measured, say `columns: {{<state>: null}}`; "
+            f"no row is complete: {which}. If it was not measured, set `columns: {{<state>: null}}`; "
             "an input must be measured."
         )
     if dropped == 0:
-        return Check("finite", True, f"all {len(keep)} rows{note}"), rows
+        return Check("finite", True, f"all {len(keep)} rows are finite{note}"), rows
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
-    detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or nothing in {where}); episodes are cut there{note}"
+    detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or empty in {where}); episodes are cut there{note}"
     return Check("finite", False, detail), rows.take(keep)
 
 
@@ -67,7 +65,7 @@ def constant(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
     still = [name for name, values in columns.items() if np.ptp(values) == 0]
     moving = [name for name in columns if name not in still and name not in {q.name for q in model.inputs}]
     if columns and not moving:
-        raise DataError(f"nothing moves: {', '.join(still)} are constant over all {len(rows.time)} rows.")
+        raise DataError(f"nothing changes: {', '.join(still)} are constant over all {len(rows.time)} rows.")
     return Check("constant", not still, f"constant: {', '.join(still)}" if still else "every column changes")
 
 
@@ -85,14 +83,14 @@ def ranges(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:
         box = f"[{quantity.low:g}, {quantity.high:g}] {quantity.unit}".rstrip()
         in_degrees = f": is it in degrees? Then multiply the column by pi/180 ({math.pi / 180:.4f})"
         if quantity.unit.startswith("rad") and quantity.periodic and _too_fast(rows, values, quantity, model):
-            found.append(f"{name} reaches {np.max(np.abs(values)):.4g}, most of it outside {box}{in_degrees}")
+            found.append(f"{name} reaches {np.max(np.abs(values)):.4g}, most values outside {box}{in_degrees}")
         elif outside:
             cure = ""
             if outside > MOSTLY * len(values):
-                cure = in_degrees if quantity.unit.startswith("rad") else ": compare the unit of the column"
+                cure = in_degrees if quantity.unit.startswith("rad") else ": check the unit of the column"
             elif (far := _farthest(values, quantity)) is not None:
-                cure = f", as far as {far:.4g}: a spike? It spoils every fit; take it out"
-            found.append(f"{name} {outside} of {len(values)} outside {box}{cure}")
+                cure = f", the farthest is {far:.4g}: remove it if it is an outlier, it would distort every fit"
+            found.append(f"{name}: {outside} of {len(values)} values outside {box}{cure}")
     return Check("ranges", not found, "; ".join(found) if found else "all values inside the declared ranges")
 
 

@@ -1,1 +1,1 @@
-"""The experiment that distinguishes causes which the measurements cannot."""
+"""The next experiment: it distinguishes causes that the present measurements do not distinguish."""

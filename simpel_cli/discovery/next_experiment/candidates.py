@@ -25,7 +25,7 @@ class Proposal(NamedTuple):
 
     Args:
         kind: FREE or one of DRIVEN.
-        share: of the range of the input about its rest, negative: begins downwards.
+        share: of the range of the input about its rest value; negative: begins downwards.
         pace: cycles in the episode, of the fastest part.
         driven: which input moves; None: all do.
         seed: of what is random in it.
@@ -86,7 +86,7 @@ def random_start(reach: Reach, random: np.random.Generator) -> np.ndarray:
     """Return a start that was seen, or one at rest anywhere the data reached."""
     if random.random() < 0.3:
         return reach.seen[random.integers(len(reach.seen))]
-    # ends are likely: what was not covered in between shows from there
+    # ends of the range are likely: episodes from there also cover what lies in between
     where = np.clip(random.uniform(-0.2, 1.2, len(reach.low)), 0, 1)
     return np.where(reach.free, reach.low + where * (reach.high - reach.low), reach.rest)
 

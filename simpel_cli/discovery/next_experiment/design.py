@@ -1,4 +1,4 @@
-"""The episode that tells tied causes apart: the one whose least expected log-likelihood ratio is the largest.
+"""The episode that distinguishes tied causes: the one whose least expected log-likelihood ratio is the largest.
 
     max over admissible episodes of min over ordered pairs (i, j) of the class of min(D_ij, d_ij)    (see `discriminate`)
 
@@ -34,13 +34,13 @@ from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.runs.files import write_text
 
 FILE = "next_experiment.csv"
-LOUDER = (1.0, 1.5, 2.5, 5.0, 15.0, 100.0)  # factors on the process noise that a member may resort to
+LOUDER = (1.0, 1.5, 2.5, 5.0, 15.0, 100.0)  # factors on the process noise that a member may have
 BATCH = 32  # episodes per call of the compiled program
 WIDE, NEAR = 2, 3  # calls over the families, and near the best
 KEPT = 4  # episodes whose neighbours are tried
 MOST = 6  # members
-ENOUGH = 30.0  # nats of a pair beyond which more are not worth anything
-HOPELESS = 0.1  # nats: repeating an episode that tells less is no plan
+ENOUGH = 30.0  # nats of a pair beyond which more are not rewarded
+HOPELESS = 0.1  # nats: below, repeating the episode is not advised
 Pair = tuple[int, int]
 
 
@@ -49,11 +49,11 @@ class Class(NamedTuple):
 
     trials: tuple[Trial, ...]
     names: tuple[str, ...]
-    pairs: tuple[Pair, ...]  # ordered: (true, judged against)
+    pairs: tuple[Pair, ...]  # ordered: (true, compared with)
 
 
 class Design(NamedTuple):
-    """One judged episode.
+    """One evaluated episode.
 
     Args:
         proposal: what to do.
@@ -87,7 +87,7 @@ def next_experiment(search: Search, selection: Selection, directory: Path) -> di
     best = designer.best()
     if best is None:
         names = " and ".join(_words(n) for n in tied.names)
-        text = f"No episode was found that tells {names} apart and keeps all states within their declared ranges."
+        text = f"No episode was found that distinguishes {names} and keeps all states within their declared ranges."
         nothing: dict[str, Any] = {"file": None, "start": None, "kind": None, "seconds": 0.0, "units": {}, "pairs": []}
         return nothing | {"expected_log_likelihood_ratio": 0.0, "description": text}
     found = _verdict(search, tied, best)
@@ -130,7 +130,7 @@ def class_of(search: Search, selection: Selection) -> Class:
 
 
 class Designer:
-    """Judges episodes for one class; one compiled program."""
+    """Evaluates episodes for one class; one compiled program."""
 
     def __init__(self, search: Search, tied: Class) -> None:
         plan = search.plan
@@ -158,7 +158,7 @@ class Designer:
         return max(designs, key=lambda d: d.score, default=None)
 
     def __call__(self, episodes: Sequence[Proposal]) -> list[Design]:
-        """Judge at most BATCH episodes; those that are not admissible are left out."""
+        """Evaluate at most BATCH episodes; those that are not admissible are left out."""
         self.tried += len(episodes)
         inputs = [signal(e, self.model.inputs, self.rows, self.model.dt) for e in episodes]
         padded = [*range(len(episodes)), *[0] * (BATCH - len(episodes))]
@@ -169,13 +169,13 @@ class Designer:
         forecast: Forecast = self._program(self.members, *(jnp.asarray(a) for a in given))
         ratio, distance, mean, states, finite = (np.asarray(a) for a in forecast)
         fine = finite & self._inside(states)
-        ratio = np.minimum(ratio, distance)  # what the noise alone would tell is not relied on
+        ratio = np.minimum(ratio, distance)  # a difference in the noise alone does not count
         pairs = tuple(np.array(self.tied.pairs).T)
         designs = []
         for i, episode in enumerate(episodes):
             if fine[i]:
                 ratios = ratio[i][pairs]
-                # between equals of the least pair, the others decide
+                # if the least pair is equal, the other pairs decide
                 score = ratios.min() + 0.01 * np.minimum(ratios, ENOUGH).mean()
                 designs.append(Design(episode, inputs[i], ratio[i], mean[i], float(ratios.min()), float(score)))
         return designs
@@ -236,7 +236,7 @@ def _verdict(search: Search, tied: Class, best: Design) -> dict[str, Any]:
 
 
 def _sentence(search: Search, tied: Class, best: Design) -> str:
-    """Say what to do, for how long, and how much it is expected to tell."""
+    """Return what to do, for how long, and the expected gain in log evidence."""
     model = search.plan.augmented.model
     seconds = f"{len(best.inputs) * model.dt:.3g} s"
     start = ", ".join(
@@ -249,10 +249,10 @@ def _sentence(search: Search, tied: Class, best: Design) -> str:
     )
     i, j = min(tied.pairs, key=lambda pair: best.ratio[pair])
     names = f"{_words(tied.names[i])} and {_words(tied.names[j])}"
-    others = " (any other pair of the class: more)" if len(tied.names) > 2 else ""
+    others = " (more for any other pair of causes)" if len(tied.names) > 2 else ""
     doing = f"the {seconds} {best.proposal.kind} of {FILE} from {start}" + (f" ({spans})" if spans else "")
     if best.least >= TIE:
-        return f"Run {doing}: expected {best.least:.0f} nats between {names}{others}."
+        return f"Run {doing}. Expected gain in log evidence between {names}: {best.least:.0f} nats{others}."
     least = max(best.least, 0.0)
     advice = (
         f"repeat it {int(np.ceil(TIE / least))} times, or lower the measurement noise"
@@ -260,13 +260,13 @@ def _sentence(search: Search, tied: Class, best: Design) -> str:
         else "repeating it would not help; lower the measurement noise, widen the ranges, or measure something else"
     )
     return (
-        f"No admissible experiment of {seconds} was found that tells {names} apart. The best, {doing}, is expected to "
-        f"tell {least:.1f} nats: {advice}."
+        f"No admissible experiment of {seconds} was found that distinguishes {names}. The best, {doing}, has an expected "
+        f"gain in log evidence of {least:.1f} nats: {advice}."
     )
 
 
 def _csv(search: Search, tied: Class, best: Design, found: dict[str, Any]) -> str:
-    """Return the episode as CSV: time, inputs, and what each member predicts to be measured."""
+    """Return the episode as CSV: time, inputs, and the measurements that each member predicts."""
     model, measured = search.plan.augmented.model, search.plan.augmented.measured
     units = {q.name: q.unit for q in (*model.states, *model.inputs)}
     columns: dict[str, np.ndarray] = {"time": np.round(np.arange(len(best.inputs)) * model.dt, 9)}
@@ -280,7 +280,7 @@ def _csv(search: Search, tied: Class, best: Design, found: dict[str, Any]) -> st
     notes = [
         found["description"],
         f"start: {start}",
-        "inputs are held from a row to the next; <channel>_if_<effect> is what would be measured without noise",
+        "inputs are held constant until the next row; <channel>_if_<effect> is the predicted measurement without noise",
     ]
     return "".join(f"# {line}\n" for line in notes) + pd.DataFrame(columns).to_csv(index=False)
 

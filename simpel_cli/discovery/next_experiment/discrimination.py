@@ -1,4 +1,4 @@
-"""How much an episode that was not yet run is expected to tell between fitted models.
+"""Expected gain in log evidence between fitted models from an episode that was not yet run.
 
 Each model j is linearised along the episode that it predicts, with mean m_j, process and measurement noise V_j, and the
 derivative A_j of the mean along the principal directions of its parameters' posterior, in standard deviations. What j
@@ -12,7 +12,7 @@ what it does not explain process noise: p_j is a mixture over louder levels of i
 them, and the expectation of a mixture's logarithm is taken inside of it.
 
 Part of D_ij is that i and j disturb themselves differently. That is only as good as the linearisation: at standstill a dry
-friction is linearised as a stiff damper, whose noise looks like no other's. So the distance of the means is given, too, by
+friction is linearised as a stiff damper, whose noise differs from all others. So the distance of the means is given, too, by
 how much less j thinks of the mean of i than of its own, with its own noise about both:
 
     d_ij = E[log p_j(m_j + v) - log p_j(m_i + v)],  v ~ N(0, V_j)    (1/2 (m_i - m_j)' (V_j + A_j A_j')^-1 (m_i - m_j))
@@ -94,7 +94,7 @@ def forecast(
     rows: int,
     dt: float,
 ) -> Forecast:
-    """Judge episodes.
+    """Evaluate episodes.
 
     Args:
         rule: the filter of the augmented model.

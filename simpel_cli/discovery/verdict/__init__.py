@@ -1,1 +1,1 @@
-"""What the search says in the end: verdict, aliases, what cannot be detected, the corrected simulator, tables."""
+"""The results of a search: verdict, aliases, undetectable effects, the corrected simulator, tables."""

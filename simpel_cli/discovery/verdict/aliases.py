@@ -1,7 +1,7 @@
-"""Effects that are one function under two names in a given model, so that no data can tell them apart.
+"""Effects that are the same function in a given model, so that no data can distinguish them.
 
-An offset of a motor's voltage and a constant load are the same push where the voltage enters with a constant gain, and are
-not where it does not: so the model decides, not a list.
+An offset of a motor's voltage and a constant load are the same force if the voltage enters with a constant gain, and differ
+otherwise: this depends on the model.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ def are_aliases(search: Search, chosen: Trial, first: tuple[int, Trial], second:
 
 
 def _pushes(search: Search, chosen: Trial, term: int, fitted: Trial, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return what a term at its fitted size changes in the rates, (nx, points); the rest of the model as in `chosen`."""
+    """Return the change of the rates by a term at its fitted size, (nx, points); the rest of the model as in `chosen`."""
     coordinates, function = search.plan.coordinates, search.plan.augmented.function
     off = search.off(chosen.optimum.z, chosen.terms)
     on = off.copy()

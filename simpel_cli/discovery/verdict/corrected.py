@@ -10,9 +10,9 @@ from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENS
 from simulators.model import Model
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
-_SENSOR = "a simulator says what happens, not what a sensor reads: correct the measurements instead"
+_SENSOR = "a simulator describes the system, not its sensors: correct the measurements instead"
 CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
-    BACKLASH: "a transition cannot tell on which side of its play an input is: that may have been settled long ago"
+    BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain"
 }
 
 
@@ -93,7 +93,7 @@ def _declared(
         elif term.kind == INPUT:
             own = {term.acts_on: given.get(term.acts_on, term.acts_on)}
             given[term.acts_on] = f"({_renamed(term.expression, names | own)})"
-    # what the simulator says with the inputs as they act: every term adds to that, and takes its rates from that
+    # the rates of the simulator with the changed inputs: every term adds to these, and takes its rates from these
     base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
     rates = {f"rate_{state}": f"({text})" for state, text in base.items()}
     node["dynamics"] = dict(base)

@@ -1,9 +1,9 @@
-"""What a search shows: forces, free runs, one-step errors and effects of the models before and after, as tables.
+"""Tables of a search: latent forces, simulated episodes, one-step errors and effects of the models before and after.
 
 Three models are compared. `before`: the simulator, calibrated. `after`: with the effects that were found. `without`: the
-parameters of `after`, the effects switched off; its latent force is what the effects have to explain, without a shift of
-the other parameters in between. Latent forces of all three are smoothed with the process noise of `before`: with its own,
-hardly any, the corrected model would be right by assumption.
+parameters of `after`, the effects switched off; its latent force is the part that the effects have to explain, with all
+other parameters equal. Latent forces of all three are smoothed with the process noise of `before`: the corrected model has
+hardly any of its own, so that its latent force would be zero by assumption.
 """
 
 from collections.abc import Sequence
@@ -120,7 +120,7 @@ def evidence_tables(
 
 
 def _curves(search: Search, selection: Selection, span: dict[str, np.ndarray]) -> Columns:
-    """Return what every effect does along each of its arguments, the other quantities at their median.
+    """Return the curve of every effect along each of its arguments, the other quantities at their median.
 
     An effect with memory, on a sensor or of the model's own rate has no such curve.
     """

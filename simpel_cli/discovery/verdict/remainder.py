@@ -1,4 +1,4 @@
-"""What is left when the search ends: an unnamed function, a time-dependent disturbance, or autocorrelated errors."""
+"""Model error after the search: an unknown function, a time-dependent disturbance, or autocorrelated errors."""
 
 from typing import Any
 
@@ -17,11 +17,11 @@ ALIKE = 0.3  # of an input's variance, at the period of a disturbance
 def remainder_of(
     search: Search, selection: Selection, disturbance: Disturbance | None, learnt: Assessment
 ) -> dict[str, Any] | None:
-    """Return `remainder` of `verdict.json`; None where nothing is left.
+    """Return `remainder` of `verdict.json`; None if no model error is found.
 
     Args:
         search: that was run.
-        selection: what it chose, and a function without a name that the data still ask for.
+        selection: what it chose, and an unknown function that improves it further.
         disturbance: a force that depends on time alone; None: there is none.
         learnt: the corrected model on the windows that it was fitted to.
     """
@@ -30,7 +30,7 @@ def remainder_of(
 
 
 def dependence(remainder: dict[str, Any]) -> str:
-    """Return what a remainder depends on, in words."""
+    """Return what the remaining model error depends on, in words."""
     period = remainder.get("period")
     return ", ".join(remainder["depends_on"]) + (f", with a period of about {period:.3g} s" if period else "")
 
@@ -48,8 +48,8 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
         "rms": level / np.sqrt(search.plan.augmented.model.dt),
         "unit": unit,
         "log_evidence_gain": gain,
-        "description": f"something acts on d({term.acts_on})/dt that depends on {', '.join(term.depends_on)} and is "
-        f"no effect of the catalogue (typical rate of the data: {scale:.3g} {unit})",
+        "description": f"an unknown function of {', '.join(term.depends_on)} acts on d({term.acts_on})/dt "
+        f"(typical rate in the data: {scale:.3g} {unit})",
     }
 
 
@@ -61,13 +61,13 @@ def _of_time(search: Search, disturbance: Disturbance) -> dict[str, Any]:
         "unit": _unit(search, disturbance.acts_on),
         "log_evidence_gain": disturbance.gain,
         "period": disturbance.period,
-        "description": f"something acts on d({disturbance.acts_on})/dt, or on a sensor of it, "
+        "description": f"a disturbance acts on d({disturbance.acts_on})/dt, or on its sensor, "
         f"that {disturbance.how}{_like(search, disturbance.period)}",
     }
 
 
 def _like(search: Search, period: float | None) -> str:
-    """Say which inputs have the same period: then it may be a function of them after all."""
+    """Name the inputs that have the same period: the disturbance may be a function of them."""
     if period is None:
         return ""
     model, plan = search.plan.augmented.model, search.plan
@@ -79,7 +79,7 @@ def _like(search: Search, period: float | None) -> str:
     spread = ((u - u.mean(axis=1, keepdims=True)) ** 2).sum(axis=(0, 1))
     names = [q.name for q, all_of_it, rest in zip(model.inputs, spread, (left**2).sum(axis=(0, 1)), strict=True)
              if rest < (1 - ALIKE) * all_of_it]  # fmt: skip
-    return f", as {' and '.join(names)} does, of which it may be a function" if names else ""
+    return f", the same as that of {' and '.join(names)}: possibly a function of the input" if names else ""
 
 
 def _unit(search: Search, state: str) -> str:
@@ -88,7 +88,7 @@ def _unit(search: Search, state: str) -> str:
 
 
 def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, Any] | None:
-    """Describe a force that no candidate explains but that the filter sees and follows; None where there is none."""
+    """Describe a disturbance that no candidate explains but that the filter follows; None if there is none."""
     errors = learnt.one_step / np.sqrt(learnt.variance)
     found = {
         name: correlated
@@ -99,7 +99,7 @@ def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, An
         return None
     worst = max(found, key=lambda name: abs(found[name][0]))
     r, lag = found[worst]
-    apart = "from row to row" if lag == 1 else f"between rows that are {lag} apart"
+    apart = "from row to row" if lag == 1 else f"at a distance of {lag} rows"
     model, roles = search.plan.augmented.model, search.plan.augmented.roles
     speed = {position: velocity for velocity, position in roles.velocity.items() if position}
     acts_on = speed.get(worst, worst)
@@ -109,9 +109,9 @@ def _followed(search: Search, chosen: Trial, learnt: Assessment) -> dict[str, An
         "rms": noise_of(search, chosen)[1] / np.sqrt(model.dt),
         "unit": _unit(search, acts_on),
         "log_evidence_gain": None,
-        "description": f"something acts on d({acts_on})/dt that is no function of the states and inputs of the model: the "
-        f"one-step errors of {worst} have a memory (correlation {r:.2f} {apart}); it depends on time, or on what was not "
-        "recorded",
+        "description": f"a disturbance acts on d({acts_on})/dt that is not a function of the states and inputs: the one-step "
+        f"errors of {worst} are autocorrelated (correlation {r:.2f} {apart}); it depends on time, or on a quantity that was "
+        "not recorded",
     }
 
 

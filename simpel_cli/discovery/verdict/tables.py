@@ -1,4 +1,4 @@
-"""Tables of a search: what every figure and table of its report is made of."""
+"""Tables of a search, from which the figures and tables of its report are made."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -39,7 +39,7 @@ def residual_columns(
         model: before, without (the corrected parameters, effects switched off) or after.
         split: train or test.
         found: force and smoothed states, angles between -pi and pi.
-        effect: (W, T - 1, nx) what the effects that were found do in these states, per second.
+        effect: (W, T - 1, nx) contribution of the effects that were found to the rates in these states.
         windows: of the split.
         episodes: of the split.
         driven: row of the state -> (its name, unit of its force).
@@ -72,7 +72,7 @@ def column_names(names: Sequence[str]) -> list[str]:
 def innovation_columns(
     model: str, split: str, found: Assessment, windows: Windows, episodes: Sequence[Episode], measured: Sequence[str]
 ) -> Columns:
-    """Return one-step errors and the standard deviation that the model claims for them."""
+    """Return one-step errors and the standard deviation that the model predicts for them."""
     parts = []
     for w, piece in enumerate(pieces(windows, episodes)):
         n = len(piece.rows)
@@ -94,7 +94,7 @@ def trajectory_columns(
     episodes: Sequence[Episode],
     measured: Mapping[str, str],
 ) -> Columns:
-    """Return measured values and free runs, from the row on from which no measurement was looked at.
+    """Return measured values and simulated episodes, which use no measurement after their first rows.
 
     Args:
         before: the calibrated simulator on the windows.
@@ -188,7 +188,7 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
 
 
 def candidate_columns(search: Search, selection: Selection) -> Columns:
-    """Return every candidate of every step: what it would add to the evidence, and whether that step added it."""
+    """Return every candidate of every step: its gain in log evidence, and whether that step added it."""
     rows = []
     for step, stage in enumerate(selection.stages, start=1):
         following = selection.stages[step].before.terms if step < len(selection.stages) else selection.chosen.terms

@@ -1,4 +1,4 @@
-"""Effects that the data cannot show at all, whatever their size: neither found nor ruled out.
+"""Effects that these data cannot detect, whatever their size: neither found nor ruled out.
 
 At an effect's start points, with everything else that moves refitted, its first parameter has the information
 
@@ -20,7 +20,7 @@ from simpel_cli.discovery.search.trials import Search, Trial
 
 FAULTS = ("kinematics", "stale")  # checks of the data that can hide or feign an effect
 SHOWN = 6  # names in a sentence
-SURPRISING = 1.5  # times the standard deviation that the model claims, on episodes that it did not see
+SURPRISING = 1.5  # times the standard deviation that the model predicts, on test episodes
 
 
 def undetectable(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> list[dict[str, str]]:
@@ -47,7 +47,7 @@ def undetectable(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> 
         {
             "name": search.terms[t].effect, "acts_on": search.terms[t].acts_on,
             "reason": f"{search.terms[t].acts_on} never changes" if search.terms[t].acts_on in still
-            else "these data would look the same with any of its sizes",
+            else "its size has no visible influence on these data",
         }
         for t in asked if t not in seen
     ]  # fmt: skip
@@ -56,22 +56,22 @@ def undetectable(search: Search, chosen: Trial, episodes: Sequence[Episode]) -> 
 def in_words(entries: Sequence[dict[str, str]]) -> list[str]:
     """Return what was not tested as a few words each, long lists cut."""
     named = [f"{e['name'].replace('_', ' ')} on {e['acts_on']} ({e['reason']})" for e in entries[:SHOWN]]
-    return [*named, f"{len(entries) - SHOWN} effects more"] if len(entries) > SHOWN else named
+    return [*named, f"{len(entries) - SHOWN} more effects"] if len(entries) > SHOWN else named
 
 
 def caveats(found: dict[str, Any]) -> str:
-    """Return what a verdict must add: what was not tested, what is wrong with the data, whether the test surprised it."""
+    """Return the caveats of a verdict: effects not tested, faults of the data, test errors larger than predicted."""
     text = ""
     if found["verdict"] in ("none", "unexplained"):
         names = in_words(found["not_tested"])
         text += f" Not tested by these data: {', '.join(names)}." if names else ""
         faults = [c["check"] for c in found["data_checks"] if not c["ok"] and c["check"] in FAULTS]
-        text += f" The data have faults that come first: {', '.join(faults)}." if faults else ""
+        text += f" Correct these faults of the data first: {', '.join(faults)}." if faults else ""
     name, most = max(found["error"]["surprise"].items(), key=lambda entry: np.nan_to_num(entry[1]))
     if most > SURPRISING:
         text += (
-            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times what the model expects: they may "
-            "go where the training episodes did not."
+            f" On the test episodes the errors one step ahead in {name} are {most:.2g} times as large as the model predicts: "
+            "the test episodes may reach states that the training episodes do not cover."
         )
     return text
 

@@ -1,4 +1,4 @@
-"""What a search says in the end: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
+"""The verdict of a search: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
-LOST = -20.0  # nats: a fit this far below the model that it contains did not arrive, and says nothing about size
+LOST = -20.0  # nats: a fit so far below the simpler model has not converged, and its size has no meaning
 SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
 Z90, Z95 = 1.6448536269514722, 1.959963984540054
 
@@ -40,7 +40,7 @@ def verdict_of(
         gates: one per chosen term, in order.
         before: the calibrated simulator on the test windows.
         after: the corrected one.
-        remainder: what is left unexplained (`remainder_of`).
+        remainder: the remaining model error (`remainder_of`).
         windows: the test windows.
         checks: of the data.
         horizon: rows.
@@ -152,7 +152,7 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
 
 
 def _distinct(effect: dict[str, Any]) -> list[str]:
-    """Names of a class that some data could tell apart, with the place where a name has several."""
+    """Names of a class that some data could distinguish, with the place where a name has several."""
     first, *others = effect["class_members"]
     return _labels(effect, [first, *(m for m in others if not m["same"])])
 
@@ -182,7 +182,7 @@ def _shaken(search: Search, trial: Trial) -> float:
 
 
 def _not_found(search: Search, selection: Selection) -> list[dict[str, Any]]:
-    """Return the smallest size of every other effect that would have been seen: it earns what one more effect is asked."""
+    """Return the smallest detectable size of every other effect: with it the effect would have been accepted."""
     last = selection.stages[-1]
     if last.before.terms != selection.chosen.terms:
         return []
@@ -215,12 +215,14 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
     best = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else 0
     steps = found["error"]["horizon_steps"]
     goes = "falls" if second[best] < first[best] else "does not fall: it goes"
-    gain = f"The error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
+    gain = f"The test error {steps} rows ahead in {measured[best]} {goes} from {first[best]:.3g} to {second[best]:.3g}."
     if not np.isfinite(ratio).any():
-        gain = f"No test episode is more than {steps} rows long, so that errors as far ahead are not known (discovery.horizon)."
+        gain = (
+            f"No test episode is longer than {steps} rows, so the error so far ahead is not known (discovery.horizon)."
+        )
     parts = [_phrase(e) for e in found["effects"]]
     listed = " and ".join(parts)
-    rest = f" What is left depends on {dependence(found['remainder'])}." if found["remainder"] else ""
+    rest = f" The remaining model error depends on {dependence(found['remainder'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
@@ -228,20 +230,20 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
             names = " or ".join(_distinct(tied))
             also = (
-                f" Besides: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
+                f" Also found: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
                 if len(parts) > 1
                 else ""
             )
             return f"Causes that fit these data equally well: {names}.{also} {gain}{rest}"
         case "unexplained":
-            return f"The simulator lacks something without a name: {found['remainder']['description']}."
+            return f"No known effect explains the model error: {found['remainder']['description']}."
         case _:
-            text = "Nothing is missing that these data could show: the calibrated simulator explains them"
+            text = "No missing effect was found: the calibrated simulator explains these data"
             if found["process_noise"]["share_after"] < SHAKEN:
                 return f"{text}."
             return (
-                f"{text} but for what looks like white noise in the rates ({found['process_noise']['after']:.2g} per "
-                "square root of a second): disturbances, or something that changes faster than the rows can show."
+                f"{text}, except for white noise in the rates ({found['process_noise']['after']:.2g} per square root of a "
+                "second): random disturbances, or an effect that changes faster than the sampling can show."
             )
 
 
@@ -250,6 +252,6 @@ def _phrase(effect: dict[str, Any]) -> str:
         f"{name} = {p['value']:.3g} ({p['low']:.3g}..{p['high']:.3g}) {p['unit']}"
         for name, p in effect["parameters"].items()
     )
-    twin = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
-    also = f", which here is the same as {' and '.join(twin)}" if twin else ""
+    aliases = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
+    also = f", in this model the same as {' and '.join(aliases)}" if aliases else ""
     return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}"

@@ -48,7 +48,7 @@ def new_figure(
 
 
 def line_style(i: int) -> dict[str, Any]:
-    """Colour and dashes of the i-th line: no two of the first 24 look the same, and later ones differ by a marker."""
+    """Colour and dashes of the i-th line: the first 24 all differ, and later ones differ by a marker."""
     dash, marker = (i // len(COLOURS)) % len(DASHES), i // (len(COLOURS) * len(DASHES))
     return {
         "color": COLOURS[i % len(COLOURS)],

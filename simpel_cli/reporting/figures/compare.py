@@ -1,4 +1,4 @@
-"""Figures of many runs: how each method learned, and whether it is right about itself."""
+"""Figures of many runs: learning curves and calibration of each method."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,11 +9,11 @@ import numpy as np
 from simpel_cli.reporting.figures.canvas import distinct, legend_below, line_style, new_figure, save
 
 MOST_LINES = 60  # of a panel; of more, every k-th is drawn
-EARLY = 0.05  # of a run, whose fall is not what one looks for
+EARLY = 0.05  # of a run; its steep fall is left out of the axis limits
 
 
 class Course(NamedTuple):
-    """What a run went through.
+    """The learning curve of a run.
 
     Args:
         variant: name of its method.

@@ -1,4 +1,4 @@
-"""Figures of control: learning curves, paths in the true world, the manoeuvre as a film. From Parquet only."""
+"""Figures of control: learning curves, paths in the true simulator, an animation of the manoeuvre. From Parquet only."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ DURATION = 67  # of a frame, ms
 
 
 def draw_control(directory: Path) -> list[Path]:
-    """Draw what a run's Parquet files tell; of a car in the plane a film, too."""
+    """Draw the figures of a run from its Parquet files; of a car in the plane an animation, too."""
     made = []
     rows = [r for r in read_metrics(directory / "metrics.parquet") if r["split"] == "train"]
     if rows:
@@ -39,7 +39,7 @@ def draw_control(directory: Path) -> list[Path]:
 
 
 def draw_online(directory: Path) -> list[Path]:
-    """Draw what the Parquet files of an online run tell: returns by episode, paths of the episodes, the last as a film."""
+    """Draw the figures of an online run: returns by episode, paths of the episodes, an animation of the last."""
     made = [save(_returns(read_metrics(directory / "metrics.parquet")), directory / "returns.png")]
     files = sorted((directory / "episodes").glob("*.parquet"))
     tables = [read_columns(path) for path in files]
@@ -52,14 +52,14 @@ def draw_online(directory: Path) -> list[Path]:
 
 def _returns(rows: list[dict[str, Any]]) -> Any:
     figure, axes = new_figure(2, 4.2, 3.2)
-    for i, (metric, label) in enumerate((("return", "in the plant"), ("return_in_model", "in the model, beforehand"))):
+    for i, (metric, label) in enumerate((("return", "in the plant"), ("return_in_model", "predicted by the model"))):
         line = [(r["step"], r["value"]) for r in rows if r["metric"] == metric]
         axes[0].plot(*zip(*line, strict=True), color=COLOURS[i], marker="o", markersize=4, linewidth=1.2, label=label)
     axes[0].set(title="return", xlabel="episode", ylabel="return")
     legend_below(figure, axes[0])
     line = [(r["step"], r["value"]) for r in rows if r["metric"] == "nll_before"]
     axes[1].plot(*zip(*line, strict=True), color=COLOURS[2], marker="o", markersize=4, linewidth=1.2)
-    axes[1].set(title="NLL before it was learned", xlabel="episode", ylabel="nat")
+    axes[1].set(title="NLL before training on the episode", xlabel="episode", ylabel="nat")
     for axis in axes:
         axis.locator_params(axis="x", integer=True)
     return figure
@@ -78,7 +78,7 @@ def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
             "alpha": 1.0 if last else 0.15 + 0.5 * k / len(tables),
             "linewidth": 1.0,
         }
-        label = "last episode" if last else "earlier ones, later darker" if k == 0 else None
+        label = "last episode" if last else "earlier episodes (later: darker)" if k == 0 else None
         if plane:
             axes[0].plot(table["x"], table["y"], label=label, **style)
         for axis, name in zip(axes[plane:], names, strict=True):
@@ -95,12 +95,12 @@ def _courses(tables: list[dict[str, np.ndarray]], units: dict[str, str]) -> Any:
 
 
 def _course(values: np.ndarray, unit: str) -> np.ndarray:
-    """An angle runs on: a jump by a turn is none."""
+    """Angles are unwrapped."""
     return np.unwrap(values) if unit == "rad" else values
 
 
 def _curves(rows: list[dict[str, Any]]) -> Any:
-    labels = {"return_in_model": "in the model", "return_in_truth": "in the truth"}
+    labels = {"return_in_model": "in the model", "return_in_truth": "in the true simulator"}
     figure, axes = new_figure(1, 5.0, 3.4)
     for i, (metric, label) in enumerate(labels.items()):
         own = [r for r in rows if r["metric"] == metric]
@@ -108,7 +108,7 @@ def _curves(rows: list[dict[str, Any]]) -> Any:
             line = [(r["step"], r["value"]) for r in own if (r["seed"], r["output"]) == key]
             style = {"color": COLOURS[i], "linestyle": DASHES[j % len(DASHES)], "linewidth": 1, "alpha": 0.8}
             axes[0].plot(*zip(*line, strict=True), label=label if j == 0 else None, **style)
-    axes[0].set(title="learning curve, dashes tell policies apart", xlabel="steps of the model", ylabel="return")
+    axes[0].set(title="learning curve, one dash style per policy", xlabel="steps in the model", ylabel="return")
     legend_below(figure, axes[0])
     return figure
 
@@ -129,7 +129,7 @@ def _paths(table: dict[str, np.ndarray], units: dict[str, str]) -> Any:
     if plane:
         axes[0].plot(0, 0, "+", color=BLACK, markersize=10)
         axes[0].set(
-            title="paths in the true world", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"])
+            title="paths in the true simulator", xlabel=with_unit("x", units["x"]), ylabel=with_unit("y", units["y"])
         )
         axes[0].set_aspect("equal", adjustable="datalim")
     for axis, name in zip(axes[plane:], names, strict=True):

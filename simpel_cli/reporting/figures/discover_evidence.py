@@ -9,7 +9,7 @@ from simpel_cli.discovery.search.trials import ACCEPT, TIE
 from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, distinct, new_figure, with_interval
 from simpel_cli.runs.files import read_columns
 
-LOWEST = -12.0  # nats; what is worse is as good as excluded, and its bar ends at the edge
+LOWEST = -12.0  # nats; candidates below are excluded, and their bars end at the edge
 LINEAR = 10.0  # nats up to which the axis is linear; logarithmic beyond
 MOST_BARS = 11
 OTHER, TIED = "0.72", COLOURS[4]
@@ -28,7 +28,7 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
         own = {name: column[table["step"] == step] for name, column in table.items()}
         _bars(axis, own, found, float(own["asked"][0]))
         best = np.flatnonzero(own["accepted"]).tolist()
-        what = f"+ {_label(own, best[0])}" if len(best) else "nothing more is accepted"
+        what = f"+ {_label(own, best[0])}" if len(best) else "no further effect is accepted"
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
     _legend(figure)
     return figure
@@ -40,16 +40,16 @@ def _legend(figure: Any) -> None:
 
     handles = [
         Patch(color=COLOURS[0], label="accepted"),
-        Patch(color=TIED, label="as good in the final model"),
+        Patch(color=TIED, label="equally good in the final model"),
         Patch(color=OTHER, label="others"),
-        Patch(**NAMELESS, label="a function without a name"),
+        Patch(**NAMELESS, label="unknown function"),
         Line2D(
             [],
             [],
             color=COLOURS[2],
             linestyle="--",
             linewidth=1,
-            label=f"to be earned: {ACCEPT:g} nat, more in later steps",
+            label=f"required gain: {ACCEPT:g} nat, more in later steps",
         ),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
@@ -57,7 +57,7 @@ def _legend(figure: Any) -> None:
 
 def _label(own: dict[str, np.ndarray], i: int) -> str:
     if own["depends_on"][i]:
-        return f"some function of {own['depends_on'][i]} on {own['acts_on'][i]}"
+        return f"unknown function of {own['depends_on'][i]} on {own['acts_on'][i]}"
     return f"{own['effect'][i]} on {own['acts_on'][i]}".replace("_", " ")
 
 

@@ -1,4 +1,4 @@
-"""Figures of the latent force: what the simulator leaves unexplained, and what the effects that were found do about it."""
+"""Figures of the latent force, the model error of the simulator, and of the effects that explain it."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,7 +108,7 @@ def draw_effects(found: dict[str, Any], residuals: Path, curves: Path) -> Any:
         partial = own["force"] - own["effect"] + np.interp(own[argument], value, total)
         _points(axis, own[argument], partial, COLOURS[1])
         _limit(axis, partial)
-        _band(axis, binned(own[argument], partial), COLOURS[1], "seen: mean and 95 % band")
+        _band(axis, binned(own[argument], partial), COLOURS[1], "latent force: mean and 95 % band")
         if len(lines) > 1:
             for dash, (name, rows) in zip(("--", ":", "-."), lines.items(), strict=False):
                 axis.plot(value, curve["force"][rows], dash, color="0.35", linewidth=1.1, label=name.replace("_", " "))
@@ -121,11 +121,11 @@ def draw_effects(found: dict[str, Any], residuals: Path, curves: Path) -> Any:
         own = _of(table, acts_on)
         _points(axis, own["effect"], own["force"], COLOURS[1], most=5 * MOST_POINTS, alpha=0.35)
         _limit(axis, np.concatenate([own["force"], own["effect"]]), share=0.998)
-        _band(axis, binned(own["effect"], own["force"], 2 * BINS), COLOURS[1], "seen: mean and 95 % band")
+        _band(axis, binned(own["effect"], own["force"], 2 * BINS), COLOURS[1], "latent force: mean and 95 % band")
         ends = np.nanquantile(own["effect"], [0, 1])
-        axis.plot(ends, ends, color=BLACK, linewidth=1.6, label="as fitted")
+        axis.plot(ends, ends, color=BLACK, linewidth=1.6, label="equal")
         unit = own["unit"][0]
-        axis.set(xlabel=with_unit("what all effects do", unit), ylabel=with_unit(f"force seen on {acts_on}", unit))
+        axis.set(xlabel=with_unit("sum of all effects", unit), ylabel=with_unit(f"latent force on {acts_on}", unit))
         axis.set_title("all effects together", fontsize=9)
         axis.legend(fontsize=7, frameon=False)
     return figure

@@ -1,4 +1,4 @@
-"""Figure of the next experiment: what to apply, and what each of the tied causes predicts to be measured."""
+"""Figure of the next experiment: the inputs, and the measurements that each possible cause predicts."""
 
 from pathlib import Path
 from typing import Any

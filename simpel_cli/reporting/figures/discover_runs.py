@@ -1,4 +1,4 @@
-"""Figures of how the simulator runs before and after: free runs, whiteness of one-step errors, errors by horizon."""
+"""Figures of the simulator before and after: simulated episodes, whiteness of one-step errors, errors by horizon."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from simpel_cli.reporting.figures.canvas import (
 from simpel_cli.runs.files import read_columns
 
 STYLE = {"before": (COLOURS[1], "calibrated simulator", "--"), "after": (COLOURS[0], "corrected simulator", "-")}
-HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "free run"}
+HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
 
 
 def models_of(found: dict[str, Any]) -> tuple[str, ...]:
@@ -40,7 +40,7 @@ def draw_traces(found: dict[str, Any], path: Path) -> Any:
         free = np.where(own["free"], 1.0, np.nan)
         for model in models_of(found):
             colour, label, dash = STYLE[model]
-            axis.plot(own["time"], own[model] * free, dash, color=colour, linewidth=1.3, label=f"{label}, free run")
+            axis.plot(own["time"], own[model] * free, dash, color=colour, linewidth=1.3, label=label)
         _around(axis, own, models_of(found))
         axis.set(ylabel=with_unit(output, own["unit"][0]))
     axes[0].set_title(f"test episode {episode}", fontsize=9, loc="left")
@@ -90,7 +90,7 @@ def draw_whiteness(found: dict[str, Any], path: Path) -> Any:
             left.vlines(acf.lag + shift, 0, acf.value, color=colour, linewidth=2.2, label=label)
             right.plot([0, *cumulated.frequency], [0, *cumulated.value], color=colour, linewidth=1.4, label=label)
             if i == 0:
-                left.axhspan(-acf.band, acf.band, color="0.9", zorder=0, label="95 % of white errors")
+                left.axhspan(-acf.band, acf.band, color="0.9", zorder=0, label="95 % band of white errors")
                 f = np.array([0, 0.5])
                 right.fill_between(f, 2 * f - cumulated.band, 2 * f + cumulated.band, color="0.9", zorder=0)
         left.axhline(0, color="0.5", linewidth=0.8)
@@ -105,7 +105,7 @@ def draw_whiteness(found: dict[str, Any], path: Path) -> Any:
 
 
 def _trimmed(e: np.ndarray) -> np.ndarray:
-    """Cut off rows at the ends that were not judged."""
+    """Cut off rows at the ends that have no error."""
     good = np.flatnonzero(np.isfinite(e))
     return e[good[0] : good[-1] + 1] if len(good) else e[:0]
 

@@ -93,7 +93,7 @@ def _learning_curves(path: Path) -> Any:
         xlabel="step",
         ylabel="NLL per point [nat]",
     )
-    # the fall of the first steps is not what one looks for: scale the axis to what follows
+    # the steep fall of the first steps would hide the rest: scale the axis to what follows
     late = [r["value"] for r in rows if r["metric"] == "loss" and r["step"] >= 0.05 * rows[-1]["step"]]
     margin = 0.05 * (max(late) - min(late)) + 1e-9
     loss.set_ylim(min(late) - margin, max(late) + margin)
@@ -107,7 +107,7 @@ def _learning_curves(path: Path) -> Any:
 
 def _of_seeds(first: int, seeds: Collection[int]) -> str:
     """Say which seed the strong lines are of, where there are several."""
-    return f", seed {first} (others pale)" if len(seeds) > 1 else ""
+    return f", seed {first} (other seeds: pale)" if len(seeds) > 1 else ""
 
 
 def _predictions(path: Path) -> Any:
@@ -149,7 +149,7 @@ def _along_time(axis: Any, shown: dict[str, np.ndarray], label: str) -> None:
 def _against_each_other(axis: Any, shown: dict[str, np.ndarray], label: str) -> None:
     measured, mean, std = (shown[c] for c in ("measured", "mean", "std"))
     ends = [measured.min(), measured.max()]
-    axis.plot(ends, ends, color="0.6", linewidth=1, linestyle="--", label="as measured")
+    axis.plot(ends, ends, color="0.6", linewidth=1, linestyle="--", label="exact prediction")
     style = {"fmt": ".", "color": COLOURS[0], "ecolor": "#9CC7E1", "elinewidth": 1, "markersize": 4}
     axis.errorbar(measured, mean, yerr=2 * std, label="predicted, ±2 std, total", **style)
     axis.set(xlabel=f"measured {label}", ylabel=f"predicted {label}")
@@ -167,7 +167,7 @@ def _calibration(path: Path) -> Any:
         style = {"color": BLACK, "linewidth": 2.0} if output == "joint" else line_style(j) | {"linewidth": 1.2}
         axis.plot(levels, fraction, label=output, **style)
     axis.set(
-        title="calibration",
+        title="calibration, test data",
         xlabel="stated probability",
         ylabel="share of test targets inside",
         xlim=(0, 1),
@@ -186,13 +186,15 @@ def _horizon(path: Path) -> Any:
         for i, seed in enumerate(seeds):
             own = (table["output"] == output) & (table["seed"] == seed)
             alpha = 0.9 if i == 0 else 0.4
-            label = (f"error (RMSE){_of_seeds(seed, seeds)}", "claimed std") if i == 0 else (None, None)
+            label = (
+                (f"error (RMSE){_of_seeds(seed, seeds)}", "predicted standard deviation") if i == 0 else (None, None)
+            )
             axis.plot(table["horizon"][own], table["rmse"][own], color=COLOURS[1], alpha=alpha, label=label[0])
             axis.plot(
                 table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1]
             )
         unit = table["unit"][table["output"] == output][0]
-        axis.set(title=output, xlabel="time ahead [s]", ylabel=with_unit("free run", unit), ylim=(0, None))
+        axis.set(title=output, xlabel="time ahead [s]", ylabel=with_unit("error ahead", unit), ylim=(0, None))
     legend_below(figure, axes[0])
     return figure
 
@@ -210,12 +212,12 @@ def _example(path: Path) -> Any:
         own = chosen & (table["output"] == output)
         t, mean, std, measured = (table[c][own] for c in ("time", "mean", "std", "measured"))
         axis.fill_between(t, mean - 2 * std, mean + 2 * std, color=COLOURS[0], alpha=0.2, label="±2 std")
-        axis.plot(t, mean, color=COLOURS[0], linewidth=1.2, label="free run")
+        axis.plot(t, mean, color=COLOURS[0], linewidth=1.2, label="predicted")
         axis.plot(t, measured, ".", color=COLOURS[1], markersize=4, label="measured")
         axis.set(title=output, xlabel="time [s]", ylabel=with_unit("value", table["unit"][own][0]))
     legend_below(figure, axes[0])
     count = len(set(runs))
-    figure.suptitle(f"episode {typical[0]} from {typical[2]:.4g} s: the median error of {count} free runs", fontsize=9)
+    figure.suptitle(f"test episode {typical[0]} from {typical[2]:.4g} s: median error of {count} runs", fontsize=9)
     return figure
 
 
