@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simulators.model import Model
 
 SIMS = Path(__file__).parents[1] / "conf" / "sim"

@@ -71,5 +71,5 @@ def checked(overrides: list[str]) -> list[str]:
 
 
 def _force(override: str) -> str:
-    """Let `a.b=c` set what the YAML leaves out; `nodes.build` then tells a field from a typo."""
+    """Let `a.b=c` set what the YAML leaves out; `config.build` then tells a field from a typo."""
     return f"++{override}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*(\.[\w\[\]]+)+=", override) else override

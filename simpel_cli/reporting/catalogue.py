@@ -84,10 +84,10 @@ def effects(name: str | None, config_dir: Path | None) -> None:
 
 
 def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> None:
-    from simpel_cli.config import nodes
+    from simpel_cli.config.build import build
 
     try:
-        model = nodes.build(entry.node, "sim", plugins).model()
+        model = build(entry.node, "sim", plugins).model()
     except ModelError as error:
         raise ConfigError(f"{entry.path}: {error}") from error
     terminal.line(entry.comment)

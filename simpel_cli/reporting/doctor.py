@@ -138,10 +138,10 @@ def _simulator() -> tuple[bool, str]:
     import jax
     import jax.numpy as jnp
 
-    from simpel_cli.config import nodes
+    from simpel_cli.config.build import build
     from simpel_cli.dynamics.transition import encoding_of, transition
 
-    model = nodes.build(load(conf_dir() / "sim" / "pendulum.yaml"), "sim").model()
+    model = build(load(conf_dir() / "sim" / "pendulum.yaml"), "sim").model()
     encoding = encoding_of(model)
     step = transition(model, encoding).step
     s, u, p = np.array([0.3, -1.0]), np.array([0.7]), np.array([1.1, 0.9, 1.0])

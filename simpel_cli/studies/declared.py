@@ -2,8 +2,8 @@
 
 from typing import Any, NamedTuple
 
+from simpel_cli.config.build import build_groups, build_settings
 from simpel_cli.config.compose import Job
-from simpel_cli.config.nodes import build_groups, build_settings
 from simpel_cli.data import Measurements, absolute
 from simpel_cli.data.recording import Source
 from simpel_cli.evaluation.settings import Evaluation

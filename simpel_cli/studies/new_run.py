@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.config.nodes import build_settings
+from simpel_cli.config.build import build_settings
 from simpel_cli.config.resolved import dump
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_text

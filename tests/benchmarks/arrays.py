@@ -14,8 +14,8 @@ import yaml
 from jaxtyping import Array, Key
 from omegaconf import OmegaConf
 
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir, recordings_dir
-from simpel_cli.config.nodes import build
 from simpel_cli.inference.assemble import Assembled, assemble
 from simpel_cli.inference.protocols import Method, Normaliser
 from simpel_cli.inference.system import normaliser_of, system_of

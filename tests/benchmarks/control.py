@@ -22,7 +22,7 @@ import numpy as np
 import optax
 import yaml
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.control.agents.fine_tune import fine_tuned
 from simpel_cli.control.agents.policy import Policy
 from simpel_cli.control.agents.rollout import Controller, episodes, reflex

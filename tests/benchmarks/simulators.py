@@ -26,7 +26,7 @@ def measured(name: str) -> dict[str, float]:
     import jax.numpy as jnp
     import yaml
 
-    from simpel_cli.config.nodes import build
+    from simpel_cli.config.build import build
     from simpel_cli.inference.system import system_of
     from simpel_cli.priors.function_prior import SimulatorPrior
     from simpel_cli.runs.settings import Settings, configure

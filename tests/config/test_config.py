@@ -10,8 +10,8 @@ import yaml
 from command_line import ROOT, simpel
 from omegaconf import OmegaConf
 
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
-from simpel_cli.config.nodes import build
 from simpel_cli.config.overrides import checked, count_jobs
 from simpel_cli.data import Measurements
 from simpel_cli.evaluation.settings import Evaluation
@@ -107,7 +107,7 @@ OWN_TO_THE_SYSTEM = {"Declared", "MujocoWorld", "CallableWorld", "Measurements"}
 )
 def test_leaves_list_every_field(path: Path) -> None:
     """What can be set stands in the YAML with its value: users read it there."""
-    from simpel_cli.config.nodes import _resolve
+    from simpel_cli.config.build import _resolve
 
     def check(node: Mapping, where: str) -> None:
         if "_target_" in node:

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from command_line import ROOT, simpel
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.control.agents.fine_tune import fading, fine_tuned, finite
 from simpel_cli.control.agents.planner import ICEM
 from simpel_cli.control.agents.policy import Actor, Policy

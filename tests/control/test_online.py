@@ -19,7 +19,7 @@ import pytest
 import yaml
 from command_line import ROOT, simpel
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.config.resolved import load
 from simpel_cli.control.agents.policy import Actor, Policy
 from simpel_cli.control.agents.rollout import episodes, reflex

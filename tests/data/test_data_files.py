@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.data import Measurements, Recording, absolute, read, transitions
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Declared

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
-from simpel_cli.config.nodes import build
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.likelihood.augmented import augment
 from simpel_cli.discovery.likelihood.fit import Optimum

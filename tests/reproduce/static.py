@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
-from simpel_cli.config.nodes import build
 from simpel_cli.inference import loop
 from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.noise import NoiseModel

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simulators.parameters import draw
 from simulators.worlds.compiled_world import CompiledWorld
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
-from simpel_cli.config.nodes import build
 from simpel_cli.discovery.likelihood.augmented import augment
 from simulators.effects import Expression, Scales, Term, structure, unnamed
 from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from systems import whole_node
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.errors import ConfigError
 from simulators.model import Model, ModelError
 

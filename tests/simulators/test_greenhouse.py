@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from systems import model, whole_node
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators import greenhouse as physics
 from simulators.model import Model, ModelError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from systems import whole_node
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simulators.model import Coordinates, Declared, Model, ModelError, Quantity
 from simulators.worlds.rk4 import RK4

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from simpel_cli.config.nodes import build
+from simpel_cli.config.build import build
 from simpel_cli.errors import ConfigError
 
 
@@ -106,7 +106,7 @@ class TestBuild:
     @pytest.mark.parametrize(
         "target",
         [
-            "simpel_cli.config.nodes.importlib.import_module",
+            "simpel_cli.config.build.importlib.import_module",
             "simulators.model.casadi.SX",
             "simpel_cli.runs.lock.os.system",
         ],

@@ -16,7 +16,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from simpel_cli.config.classes import CLASSES, PLAIN_KEYS, ROLES, SIMULATORS, obvious_class
+from simpel_cli.config.group_classes import CLASSES, PLAIN_KEYS, ROLES, SIMULATORS, obvious_class
 from simpel_cli.errors import ConfigError, did_you_mean
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
