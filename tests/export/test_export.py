@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command_line import FIT, TINY, rig, simpel
 
-from simpel_cli.config import nodes
+from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
 from simpel_cli.config.resolved import load
 from simpel_cli.dynamics.transition import encoding_of, transition
@@ -38,7 +38,7 @@ outputs: {a: u - v}
 
 
 def model_of(node: dict[str, object]) -> Model:
-    return nodes.build(node, "sim").model()
+    return build(node, "sim").model()
 
 
 def nodes_of(name: str, tmp_path: Path) -> dict[str, object]:
