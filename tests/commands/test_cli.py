@@ -20,6 +20,10 @@ from safetensors.numpy import load_file
 
 from simpel_cli.runs.manifest import sha256
 
+VERBS = [
+    "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "sims", "effects", "example", "doctor",
+    "simulate",
+]  # fmt: skip
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),
     ("sim", pa.string()), ("data", pa.string()), ("n_train", pa.int32()), ("seed", pa.int32()), ("step", pa.int64()),
@@ -382,9 +386,13 @@ class TestWords:
     def test_version(self, tmp_path: Path) -> None:
         assert run(tmp_path, "--version").split() == ["simpel", metadata.version("simpel")]
 
-    @pytest.mark.parametrize("verb", ["fit", "evaluate", "sweep", "simulate"])
+    @pytest.mark.parametrize("verb", VERBS)
     def test_help_of_a_verb_has_two_examples(self, verb: str, tmp_path: Path) -> None:
-        assert len(re.findall(rf"^\s*simpel {verb} \S", run(tmp_path, verb, "--help"), re.M)) >= 2
+        assert len(re.findall(rf"^\s*simpel {verb}(?: \S|\s*$)", run(tmp_path, verb, "--help"), re.M)) >= 2
+
+    def test_help_shows_lists_in_brackets(self, tmp_path: Path) -> None:
+        """Brackets are markup to what prints the help, unless they are escaped."""
+        assert "'effect=[viscous_friction,coulomb_friction,input_delay]'" in run(tmp_path, "discover", "--help")
 
     def test_help_imports_nothing_heavy(self) -> None:
         code = (
