@@ -16,7 +16,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from simpel_cli.config.group_classes import CLASSES, PLAIN_KEYS, ROLES, SIMULATORS, obvious_class
+from simpel_cli.config.group_classes import CLASSES, OPTIONAL, PLAIN_KEYS, ROLES, SIMULATORS, obvious_class
 from simpel_cli.errors import ConfigError, did_you_mean
 
 OWN_PACKAGES = ("simpel_cli", "simulators")
@@ -41,7 +41,7 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
     cls = _resolve(str(target), path, plugins) if target is not None else default or obvious_class(path)
     if cls is None:
         raise ConfigError(
-            f"{path}: the key _target_ is missing; it names the class, as the options in conf/{path}/ do."
+            f"{path}: the key _target_ is missing; it names the class, as the options in conf/{path.partition('.')[0]}/ do."
         )
     role = ROLES.get(path)
     if role is not None and role not in {*dir(cls), *(f.name for f in dataclasses.fields(cls))}:
@@ -89,7 +89,9 @@ def build_settings(config: Mapping[str, Any]) -> Any:
 
 
 def build_groups(config: Mapping[str, Any], settings: Any) -> dict[str, Any]:
-    """Build every other group of a configuration, once; one that is null stays None. `effect` becomes a list.
+    """Build every other group of a configuration, once. `effect` becomes a list.
+
+    An optional group that is null or empty is None. A MuJoCo world is built where `world` names it, since it is compiled.
 
     Args:
         config: resolved.
@@ -99,9 +101,10 @@ def build_groups(config: Mapping[str, Any], settings: Any) -> dict[str, Any]:
         ConfigError: what a group's class refuses.
     """
     built: dict[str, Any] = {"run": settings}
-    for name, node in config.items():
-        if name in CLASSES and name != "run":
-            built[name] = None if node is None else _build_group(node, name, settings.plugins)
+    for name in (name for name in config if name in CLASSES and name != "run"):
+        absent = name in OPTIONAL and not config[name]
+        unused = name == "mujoco" and config.get("world") != "mujoco"
+        built[name] = None if absent or unused else _build_group(config[name], name, settings.plugins)
     return built
 
 
@@ -109,7 +112,7 @@ def _build_group(node: Any, name: str, plugins: tuple[str, ...]) -> Any:
     if name in SIMULATORS:
         return build_source(node, name, plugins)
     if name == "effect" and isinstance(node, dict):
-        return [build(dict(entry), f"effect.{key}", plugins) for key, entry in node.items()]
+        return [build(entry, f"effect.{key}", plugins) for key, entry in node.items()]
     return build(node, name, plugins)
 
 

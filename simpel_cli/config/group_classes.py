@@ -22,6 +22,17 @@ CLASSES: dict[str, str | None] = {
     "truth": "simulators.model.Declared",
     "mujoco": "simulators.worlds.mujoco_world.MujocoWorld",
 }
+OPTIONAL = (
+    "evaluation",
+    "effect",
+    "discovery",
+    "reward",
+    "control",
+    "planner",
+    "online",
+    "truth",
+    "mujoco",
+)  # may be null
 SIMULATORS = ("sim", "truth", "mujoco")  # groups whose class has a `model()`: equations, or a world that is queried
 # what a class of the group must have, whatever it is called
 ROLES = dict.fromkeys(SIMULATORS, "model") | {

@@ -102,9 +102,7 @@ def _one_line(error: Exception, verb: str, known: list[str], folders: list[Path]
     key = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
     what = lines[0] if lines else text
     if "'sim.name' not found" in what or "Index 'name'" in what:
-        return (
-            "sim.name: missing. A simulator's YAML is a mapping with the keys _target_, name, dt, states, dynamics, ..."
-        )
+        return "sim.name: missing. A simulator's YAML is a mapping with the keys name, dt, states, dynamics, ..."
     return f"{key + ': ' if key else ''}{_interpolation(what, key)}"
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import of_run
 from simpel_cli.control.agents.rollout import Episodes
@@ -50,14 +51,15 @@ def resume(directory: Path, screen: Screen, publish: Publish) -> None:
     if record["command"] != "rl-offline":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-offline.")
     refuse_changed_config(directory, record)
-    declared = declare(of_run(directory))
+    config = of_run(directory)
+    settings = build_settings(config)
     left = [directory / "report.html", directory / "metrics.parquet"]
-    left += [] if declared.groups.get("planner") else [directory / "policy" / "policy.safetensors"]
+    left += [] if config.get("planner") else [directory / "policy" / "policy.safetensors"]
     if record.get("status") == "done" and all(path.exists() for path in left):
-        Terminal(declared.settings.quiet).line(f"{directory} is complete; nothing to do.")
+        Terminal(settings.quiet).line(f"{directory} is complete; nothing to do.")
         return
-    with Manifest(directory, "rl-offline", declared.settings) as manifest:
-        _run(declared, directory, directory, manifest, screen, publish)
+    with Manifest(directory, "rl-offline", settings) as manifest:
+        _run(declare(config, settings), directory, directory, manifest, screen, publish)
 
 
 def _run(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli import evaluation as ev
+from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.control.assignment import assignment, remarks
@@ -23,6 +24,7 @@ from simpel_cli.control.rounds import (
     episode_facts,
     metric_constants,
     metric_rows,
+    own_data,
     recorded,
     refuse_wrong_data,
     why_unusable,
@@ -68,7 +70,8 @@ def rl_online(job: Job, screen: Screen, publish: Publish) -> None:
     kind, _, rest = str(config.get("world")).partition(":")
     if kind == "folder" and rest:  # a resumed run may start elsewhere
         config["world"] = f"folder:{Path(rest).expanduser().absolute()}"
-    with new_run("rl-online", config, job.directory) as (declared, manifest):
+    kept = {"data": config["data"]}  # for its choice; what is built are the keys that hold for episodes
+    with new_run("rl-online", config | {"data": own_data(config)}, job.directory, beside=kept) as (declared, manifest):
         _run(declared, job.directory, manifest, screen, publish)
 
 
@@ -88,17 +91,18 @@ def resume(directory: Path, screen: Screen, publish: Publish, overrides: Sequenc
     if record["command"] != "rl-online":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-online.")
     refuse_changed_config(directory, record)
-    declared = declare(of_run(directory))
-    old = _online(declared).episodes
+    config = of_run(directory)
+    settings = build_settings(config)
+    old = _online(declare(config, settings, only=("online",))).episodes
     episodes = _more(overrides, old)
     if episodes > old:
-        declared = declared.changed(online=(declared.config.get("online") or {}) | {"episodes": episodes})
-        write_text(directory / "config.yaml", dump(declared.config))
+        config["online"] = (config.get("online") or {}) | {"episodes": episodes}
+        write_text(directory / "config.yaml", dump(config))
     elif record.get("status") == "done" and _whole(directory, old):
-        Terminal(declared.settings.quiet).line(f"{directory} is complete; nothing to do.")
+        Terminal(settings.quiet).line(f"{directory} is complete; nothing to do.")
         return
-    with Manifest(directory, "rl-online", declared.settings) as manifest:
-        _run(declared, directory, manifest, screen, publish)
+    with Manifest(directory, "rl-online", settings) as manifest:
+        _run(declare(config | {"data": own_data(config)}, settings), directory, manifest, screen, publish)
 
 
 def _online(declared: Declared) -> Online:

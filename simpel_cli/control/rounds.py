@@ -76,9 +76,14 @@ def _record(run: OnlineRun, number: int) -> dict[str, Any]:
     return found
 
 
+def own_data(config: dict[str, Any]) -> dict[str, Any]:
+    """Return what of a configuration's data YAML holds for episodes of a plant, with no file yet."""
+    return {"path": []} | {key: value for key, value in config["data"].items() if key in MEASURED}
+
+
 def _data(run: OnlineRun, paths: Sequence[Path]) -> dict[str, Any]:
     """Return the data YAML of episodes."""
-    own = {key: value for key, value in run.declared.config["data"].items() if key in MEASURED}
+    own = own_data(run.declared.config)
     return own | {"path": [str(path) for path in paths], "time": "t", "split": {"test_fraction": 0}}
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.data import Recording
@@ -80,6 +81,7 @@ def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
         Inconclusive: `strict` and another verdict than `effect`.
     """
     config = resolved(job)
+    build_settings(config)  # a wrong key is named, also one that is replaced
     config["run"] = {**(config.get("run") or {}), "precision": "float64"}
     with new_run("discover", config, job.directory) as (declared, manifest), jax.enable_x64(True):
         found = _run(declared, job.data_folder, manifest, publish)
@@ -104,7 +106,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     searched = _search(study, terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
-    found = _verdict(searched, before, after, time.perf_counter() - began)
+    found = _verdict(searched, before, after, began)
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
@@ -153,10 +155,11 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     return Searched(search, assessor, selection, gates, disturbance, windows, recording)
 
 
-def _verdict(searched: Searched, before: Assessment, after: Assessment, seconds: float) -> dict[str, Any]:
+def _verdict(searched: Searched, before: Assessment, after: Assessment, began: float) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
     search, assessor, selection, gates, disturbance, windows, recording = searched
     left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
+    seconds = time.perf_counter() - began
     found = verdict_of(
         search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
     )

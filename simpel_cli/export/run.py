@@ -47,7 +47,7 @@ def export(run: Path, out: Path | None = None, seed: int | None = None) -> None:
             f"{run}: {record.get('status')}, not done. Go on with it first: simpel {verb} --resume {typed(run)}"
         )
     folder = run / VERBS[verb]
-    declared = declare(of_run(folder))
+    declared = declare(of_run(folder), only=("sim", "data", "method"))
     into = make_directory(out if out is not None else run / "export", "--out")
     terminal = Terminal(quiet=False)
     declared, values, meaning = _as_found(run, declared, verb)

@@ -1,5 +1,6 @@
 """Every group of a configuration as an object, built once; what comes after assembles them and builds nothing again."""
 
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from simpel_cli.config.build import build_groups, build_settings
@@ -85,17 +86,20 @@ class Declared(NamedTuple):
         return self._replace(config=self.config | nodes, groups=self.groups | build_groups(nodes, settings))
 
 
-def declare(config: dict[str, Any], settings: Settings | None = None) -> Declared:
+def declare(config: dict[str, Any], settings: Settings | None = None, only: Collection[str] | None = None) -> Declared:
     """Build every group of a resolved configuration: whatever is wrong in it is found before any file is read.
 
     Args:
         config: the configuration.
         settings: its group `run`, where it is built already.
+        only: build these groups only; None: all of them.
 
     Raises:
         ConfigError: a key.
     """
-    return Declared(config, build_groups(config, settings or build_settings(config)))
+    settings = settings or build_settings(config)
+    asked = config if only is None else {name: node for name, node in config.items() if name in only}
+    return Declared(config, build_groups(asked, settings))
 
 
 def resolved(job: Job) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError, DataError
@@ -44,13 +45,14 @@ def resume(directory: Path, screen: Screen) -> None:
     if record["command"] != "fit":
         raise ConfigError(f"{directory}: made by `simpel {record['command']}`; only a fit can be resumed.")
     refuse_changed_config(directory, record)
-    declared = declare(of_run(directory))
+    config = of_run(directory)
+    settings = build_settings(config)
     if record.get("status") == "done":
-        Terminal(declared.settings.quiet).line(f"{directory} is complete; nothing to do.")
+        Terminal(settings.quiet).line(f"{directory} is complete; nothing to do.")
         return
     inputs = record.get("inputs_sha256") or {}
-    with Manifest(directory, "fit", declared.settings, inputs=dict(inputs)) as manifest:
-        _run(open_study(declared, directory), manifest, screen, resume=True)
+    with Manifest(directory, "fit", settings, inputs=dict(inputs)) as manifest:
+        _run(open_study(declare(config, settings), directory), manifest, screen, resume=True)
 
 
 def learned(study: Study, directory: Path, screen: Screen, *, shown: bool = True) -> Learned:

@@ -1,5 +1,6 @@
 """One job of a sweep, whatever its verb: run it here, or go on with it where it was, and note how it ended."""
 
+import contextlib
 import shutil
 import threading
 import traceback
@@ -89,8 +90,10 @@ def _begun(job: Job) -> bool:
         record = read_manifest(job.directory)
     except ConfigError:
         return False
-    if job.verb in RESUMED and record.get("status") in ("running", "interrupted") and not _changed(job):
-        return True
+    if job.verb in RESUMED and record.get("status") in ("running", "interrupted"):
+        with contextlib.suppress(ConfigError):  # a configuration that this version cannot read is another one
+            if not _changed(job):
+                return True
     _set_aside(job.directory)
     return False
 

@@ -94,6 +94,7 @@ CASES = [
     case("unknown device", "fit run.device=gpus", CONFIG, "run.device: got 'gpus'; allowed are auto, cpu and gpu"),
     case("unknown score option", "fit score.shrinkage=foo", CONFIG, "got 'foo'; allowed are none and ledoit_wolf"),
     case("negative horizon", "fit evaluation.horizon=-1", CONFIG, "evaluation.horizon: got -1.0; it must be positive"),
+    case("precision of discover", "discover run.precision=nonsense", CONFIG, "run.precision: got 'nonsense'; allowed are"),
     # form
     case("no sign", "fit method.steps", CONFIG, "method.steps: not of the form key=value", "e.g. method.steps=2000"),
     case("blanks around the sign", ("fit", "method.steps = 5"), CONFIG, "without blanks around the sign"),

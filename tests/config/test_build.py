@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from simpel_cli.config.build import build
+from simpel_cli.config.build import build, build_groups
+from simpel_cli.config.group_classes import OPTIONAL
 from simpel_cli.errors import ConfigError
+from simpel_cli.runs.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -133,3 +135,31 @@ class TestBuild:
 def test_a_base_of_others_is_named_as_such(path: str, target: str) -> None:
     with pytest.raises(ConfigError, match=rf"{path}\._target_: {target} is a base of others, .* as conf/{path}/ does"):
         build({"_target_": target, "name": "x", "dt": 1}, path)
+
+
+class TestGroups:
+    @pytest.mark.parametrize("group", ["sim", "data", "prior", "score", "method", "policy", "simulation"])
+    def test_a_group_that_is_needed_is_not_null(self, group: str) -> None:
+        with pytest.raises(ConfigError, match=rf"{group}: got None; expected a mapping of keys"):
+            build_groups({group: None}, Settings())
+
+    @pytest.mark.parametrize("node", [None, {}])
+    def test_an_optional_group_may_be_null_or_empty(self, node: object) -> None:
+        assert build_groups(dict.fromkeys(OPTIONAL, node), Settings()) == {"run": Settings()} | dict.fromkeys(OPTIONAL)
+
+    def test_a_mujoco_world_is_made_where_it_is_acted_in(self) -> None:
+        node = {"name": "car", "xml": "nowhere.xml"}
+        assert build_groups({"mujoco": node, "world": "sim"}, Settings())["mujoco"] is None
+        with pytest.raises(ConfigError, match="mujoco"):
+            build_groups({"mujoco": node, "world": "mujoco"}, Settings())
+
+    def test_an_effect_without_its_name(self) -> None:
+        with pytest.raises(ConfigError, match=r"effect\.acts_on: got 'velocity'; expected a mapping of keys"):
+            build_groups({"effect": {"acts_on": "velocity"}}, Settings())
+
+    def test_a_class_that_is_missing_in_a_part(self) -> None:
+        node = {"_target_": "simpel_cli.priors.function_prior.GPPrior", "kernel": {}}
+        with pytest.raises(
+            ConfigError, match=r"prior\.kernel: the key _target_ is missing; .* options in conf/prior/ do"
+        ):
+            build_groups({"prior": node}, Settings())

@@ -1,5 +1,6 @@
 """A run that is killed or interrupted goes on bit for bit: processes of their own, real signals."""
 
+import hashlib
 import json
 import random
 import shutil
@@ -10,6 +11,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from command_line import PATIENCE, process, simpel, start
+
+from simpel_cli.config.resolved import dump, load
 
 FIT = (
     "fit", "experiment=pendulum", "method.steps=6000", "method.particles=6", "method.network.hidden=[32,32]",
@@ -91,6 +94,26 @@ def test_killed_before_the_first_checkpoint(uninterrupted: Path, tmp_path: Path)
     assert result.code == 0, result.err
     assert metrics(run) == metrics(uninterrupted)
     assert state(run) == state(uninterrupted)
+
+
+@pytest.mark.parametrize(("before", "code", "after"), [("done", 0, "done"), ("interrupted", 2, "failed")])
+def test_a_run_whose_plug_in_is_missing(
+    uninterrupted: Path, tmp_path: Path, before: str, code: int, after: str
+) -> None:
+    """A complete run is complete in any case; what stops another one is noted in its manifest."""
+    run = tmp_path / "run"
+    shutil.copytree(uninterrupted, run)
+    config = load(run / "config.yaml")
+    config["run"]["plugins"], config["method"]["_target_"] = ["gone"], "gone.Method"
+    (run / "config.yaml").write_text(dump(config))
+    record = json.loads((run / "manifest.json").read_text())
+    digest = hashlib.sha256((run / "config.yaml").read_bytes()).hexdigest()
+    (run / "manifest.json").write_text(json.dumps(record | {"status": before, "config_sha256": digest}))
+    result = simpel(tmp_path, "fit", "--resume", run)
+    assert result.code == code, result.err
+    assert status(run) == after
+    if code:
+        assert "cannot import gone" in json.loads((run / "manifest.json").read_text())["error"]
 
 
 def test_interrupted_while_the_report_is_written(uninterrupted: Path, tmp_path: Path) -> None:

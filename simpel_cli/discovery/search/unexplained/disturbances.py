@@ -3,9 +3,9 @@
     force(t) = c cos(w t) + s sin(w t)
 
 with its own c and s in every window, so that the rig's clock need not be known, N(0, a^2) of a few sizes a. What it would
-earn in evidence is known to first order for every frequency w (`levels`), all equally probable. White process noise, which
-the model has, spreads over all frequencies what a periodic disturbance has at one. What wanders has several: where another
-frequency is left beside the best, or less than a period fits into a window, there is no period to speak of.
+earn in evidence is known to first order for every frequency w (`noise_profile`), all equally probable. White process noise,
+which the model has, spreads over all frequencies what a periodic disturbance has at one. What wanders has several: where
+another frequency is left beside the best, or less than a period fits into a window, there is no period to speak of.
 
 Reference: Bretthorst (1988), Bayesian spectrum analysis and parameter estimation, ch. 3.
 """
@@ -132,7 +132,7 @@ def _statistics(level: Level, columns: np.ndarray) -> Statistics:
 def _evidence(statistics: Statistics, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence that the weights earn, nats, (F, sizes), and their posterior means at the last size, (F, W, 2).
 
-    As `levels.evidence` with W' W = square - shared' shared, by the matrix inversion and determinant lemmas.
+    As `noise_profile.evidence` with W' W = square - shared' shared, by the matrix inversion and determinant lemmas.
     """
     found = []
     weights = np.zeros_like(statistics.pull)
