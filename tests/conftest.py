@@ -13,9 +13,9 @@ from command_line import KEPT, ROOT
 import simpel_cli  # noqa: F401  sets XLA's flags before JAX opens its backend
 
 LONGEST = (
-    "wrong_inputs", "cli", "discover", "resume", "filter", "methods", "own_data", "recorded_systems", "estimators",
-    "uninformative_data", "sweep", "selection", "fsvgd_posterior", "exam", "next_experiment", "interactions",
-    "control", "pathwise",
+    "sweep", "discover", "online", "methods", "control", "resume", "wrong_inputs", "cli", "pathwise", "fsvgd_posterior",
+    "problem", "uninformative_data", "filter", "own_data", "selection", "estimators", "hidden_data", "next_experiment",
+    "export", "recorded_systems", "transition", "casadi_jax", "exam",
 )  # fmt: skip
 RUNS_A_VERB = {"simpel", "start", "process", "subprocess"}  # names whose use makes a test more than a unit
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs

@@ -126,6 +126,7 @@ def test_simulate(folder: Path) -> None:
     assert (folder / "my" / "made" / "card.yaml").exists()
 
 
+@pytest.mark.slow  # tests/data/test_data_smoother.py tests the estimate
 def test_velocity_not_measured(folder: Path) -> None:
     """`v: null`, as the comment in the README's data YAML says."""
     path = folder / "my" / "data" / "rig.yaml"

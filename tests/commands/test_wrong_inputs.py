@@ -396,6 +396,7 @@ def test_a_run_goes_on_when_its_reader_goes_away(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow  # as test_a_run_goes_on_when_its_reader_goes_away
 def test_a_run_without_standard_output(tmp_path: Path) -> None:
     """`simpel fit >&-`"""
     words = ["-m", "simpel_cli.main", "fit", *TINY[:-1], "hydra.run.dir=run"]

@@ -585,6 +585,7 @@ def test_coloured_noise_has_unit_variance(colour: float, ahead: int) -> None:
     assert alike > 0.4 if colour else abs(alike) < 0.03
 
 
+@pytest.mark.slow  # the planner itself is tested above
 def test_a_planner_in_place_of_a_policy(tmp_path: Path) -> None:
     small = ("planner.ahead=4", "planner.population=8", "planner.elites=2", "planner.rounds=1", "reward.horizon=12")
     result = simpel(tmp_path, *SMALL, "planner=icem", *small, "reward.settled=5", "hydra.run.dir=run")

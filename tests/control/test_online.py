@@ -533,6 +533,7 @@ def test_wrong_words(words: tuple[str, ...], message: str, tmp_path: Path) -> No
     assert "Traceback" not in result.err
 
 
+@pytest.mark.slow  # the exchange is tested above
 def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
     """As docs/how-to/control.md has it: no data, a simulator and a task; then what became of the run is not overwritten."""
     text = (ROOT / "conf" / "sim" / "pendulum.yaml").read_text().replace("phi", "angle").replace("omega", "speed")

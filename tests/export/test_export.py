@@ -205,6 +205,7 @@ def test_wrong_exports(fitted: Path, tmp_path: Path, words: tuple[str, ...], mes
     assert message in result.err
 
 
+@pytest.mark.slow  # two more fits for two messages
 def test_what_has_no_networks_of_its_own(tmp_path: Path) -> None:
     words = [
         word

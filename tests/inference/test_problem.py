@@ -179,6 +179,7 @@ def test_training_inputs_at_which_the_simulator_blows_up_are_named_too():
         )  # fmt: skip
 
 
+@pytest.mark.slow  # thousands of rows
 def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
     """Rows in the order of the file: the first half agrees with the simulator, the second is off by a smooth gap."""
     system = system_of(declared(), (), 0)

@@ -141,6 +141,7 @@ def test_likelihood_of_a_batch_stands_for_all_data(reference: Fitted) -> None:
     assert_same_posterior(fitted(dataclasses.replace(SMALL, batch=3)), reference, 0.15)
 
 
+@pytest.mark.slow  # a limit of the test above
 def test_without_prior_the_fit_is_that_of_the_data() -> None:
     free, bound = (fitted(dataclasses.replace(SMALL, prior_weight=w), at=np.append(X, GRID)) for w in (0.0, 1.0))
     data, rest = slice(0, len(X)), np.append(np.zeros(len(X), bool), INSIDE)

@@ -365,6 +365,7 @@ def edges(x: np.ndarray) -> np.ndarray:
     return x
 
 
+@pytest.mark.slow  # gradients of nine states at many points
 def test_slopes_are_finite() -> None:
     """Of the one-step map, in states, inputs and parameters: in JAX in single precision, in CasADi in double precision."""
     source = model(FILES["high", "states"])

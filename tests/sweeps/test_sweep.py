@@ -118,6 +118,7 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
             each.wait()
 
 
+@pytest.mark.slow  # the retry is tested on this machine's own workers
 def test_a_cluster_that_runs_already_and_loses_a_worker(
     tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
 ) -> None:
@@ -136,6 +137,7 @@ def test_a_cluster_that_runs_already_and_loses_a_worker(
     assert not list((tmp_path / "sweep").glob(".seen*"))
 
 
+@pytest.mark.slow  # as test_another_launcher_that_fails_by_itself, with real jobs
 def test_another_launcher_of_hydra_runs_the_same_jobs(tmp_path: Path) -> None:
     words = ["experiment=pendulum", *TINY, "run.quiet=false", "hydra.sweep.dir=sweep", "method.learning_rate=0.001,-1"]
     result = simpel(tmp_path, "sweep", *words, "hydra/launcher=basic")
