@@ -6,26 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
-from simpel_cli.config.resolved import of_run
 from simpel_cli.control.agents.rollout import Episodes
 from simpel_cli.control.assignment import Assignment, assignment, refuse_outputs, remarks
 from simpel_cli.control.planning import plan
 from simpel_cli.control.saved_policies import done_steps, of_seed, save_policies
 from simpel_cli.control.settings import CONTROL_GROUPS
 from simpel_cli.control.training import TrainedPolicies, judge_of, train
-from simpel_cli.errors import ConfigError
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.interruption import interruption, stop_if
-from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
+from simpel_cli.runs.manifest import Manifest
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.settings import configure, stream
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import Declared, declare, resolved
 from simpel_cli.studies.fit import Learned, learned
-from simpel_cli.studies.new_run import new_run
+from simpel_cli.studies.new_run import kept_run, new_run
 from simpel_cli.studies.open import open_study
 from simpel_cli.studies.screen import Screen
 
@@ -47,12 +44,7 @@ def rl_offline(job: Job, screen: Screen, publish: Publish) -> None:
 
 def resume(directory: Path, screen: Screen, publish: Publish) -> None:
     """Go on with an interrupted run, bit for bit as if it had not been interrupted."""
-    record = read_manifest(directory)
-    if record["command"] != "rl-offline":
-        raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-offline.")
-    refuse_changed_config(directory, record)
-    config = of_run(directory)
-    settings = build_settings(config)
+    record, config, settings = kept_run("rl-offline", directory)
     left = [directory / "report.html", directory / "metrics.parquet"]
     left += [] if config.get("planner") else [directory / "policy" / "policy.safetensors"]
     if record.get("status") == "done" and all(path.exists() for path in left):

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli import evaluation as ev
-from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
-from simpel_cli.config.resolved import dump, of_run
+from simpel_cli.config.resolved import dump
 from simpel_cli.control.assignment import assignment, remarks
 from simpel_cli.control.online_settings import MEASURED, Online
 from simpel_cli.control.open_plant import open_plant
@@ -37,13 +36,13 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory
 from simpel_cli.runs.files import write_text
 from simpel_cli.runs.interruption import interruption, stop_if
-from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
+from simpel_cli.runs.manifest import Manifest
 from simpel_cli.runs.metrics import MetricStream, write_metrics
 from simpel_cli.runs.settings import configure
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import Declared, declare, resolved
 from simpel_cli.studies.fit import Learned, learned
-from simpel_cli.studies.new_run import new_run
+from simpel_cli.studies.new_run import kept_run, new_run
 from simpel_cli.studies.open import open_study
 from simpel_cli.studies.prepare import posteriors
 from simpel_cli.studies.screen import Screen
@@ -87,12 +86,7 @@ def resume(directory: Path, screen: Screen, publish: Publish, overrides: Sequenc
     Raises:
         ConfigError: not such a run, or other overrides.
     """
-    record = read_manifest(directory)
-    if record["command"] != "rl-online":
-        raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by rl-online.")
-    refuse_changed_config(directory, record)
-    config = of_run(directory)
-    settings = build_settings(config)
+    record, config, settings = kept_run("rl-online", directory)
     old = _online(declare(config, settings, only=("online",))).episodes
     episodes = _more(overrides, old)
     if episodes > old:

@@ -4,20 +4,19 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
-from simpel_cli.config.resolved import dump, of_run
-from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.config.resolved import dump
+from simpel_cli.errors import DataError
 from simpel_cli.inference import loop
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import make_directory, typed
 from simpel_cli.runs.files import write_table, write_text
-from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config, sha256
+from simpel_cli.runs.manifest import Manifest, read_manifest, sha256
 from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import declare, resolved
 from simpel_cli.studies.judgement import judge
-from simpel_cli.studies.new_run import new_run
+from simpel_cli.studies.new_run import kept_run, new_run
 from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import STRETCH, Fitted, posteriors, prepare
 from simpel_cli.studies.prior_check import prior_check
@@ -41,12 +40,7 @@ def fit(job: Job, screen: Screen) -> None:
 
 def resume(directory: Path, screen: Screen) -> None:
     """Resume an interrupted fit, bit for bit as if it had not been interrupted."""
-    record = read_manifest(directory)
-    if record["command"] != "fit":
-        raise ConfigError(f"{directory}: made by `simpel {record['command']}`; only a fit can be resumed.")
-    refuse_changed_config(directory, record)
-    config = of_run(directory)
-    settings = build_settings(config)
+    record, config, settings = kept_run("fit", directory)
     if record.get("status") == "done":
         Terminal(settings.quiet).line(f"{directory} is complete; nothing to do.")
         return

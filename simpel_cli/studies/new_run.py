@@ -1,15 +1,17 @@
-"""A new run: its directory, the configuration that it keeps, its manifest, and the configuration's groups."""
+"""A run as its directory: a new one is begun with configuration and manifest, a kept one is read back to be resumed."""
 
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from simpel_cli.config.build import build_settings
-from simpel_cli.config.resolved import dump
+from simpel_cli.config.resolved import dump, of_run
+from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import make_directory, refuse_occupied
 from simpel_cli.runs.files import write_text
-from simpel_cli.runs.manifest import Manifest
+from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
+from simpel_cli.runs.settings import Settings
 from simpel_cli.studies.declared import Declared, declare
 
 
@@ -36,3 +38,31 @@ def new_run(
     write_text(directory / "config.yaml", dump(config | (beside or {})))
     with Manifest(directory, verb, settings) as manifest:
         yield declare(config, settings), manifest
+
+
+class KeptRun(NamedTuple):
+    """What a run directory says of its run, before any group but `run` is built: a complete run may lack a plug-in today.
+
+    Args:
+        record: its manifest.
+        config: resolved.
+        settings: the group `run`.
+    """
+
+    record: dict[str, Any]
+    config: dict[str, Any]
+    settings: Settings
+
+
+def kept_run(verb: str, directory: Path) -> KeptRun:
+    """Read back a run that is to be resumed.
+
+    Raises:
+        ConfigError: of another verb or version, or its configuration was changed.
+    """
+    record = read_manifest(directory)
+    if record["command"] != verb:
+        raise ConfigError(f"{directory}: made by `simpel {record['command']}`, not by `simpel {verb}`.")
+    refuse_changed_config(directory, record)
+    config = of_run(directory)
+    return KeptRun(record, config, build_settings(config))

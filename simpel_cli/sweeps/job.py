@@ -12,7 +12,6 @@ from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import of_run
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.runs.console import silence
-from simpel_cli.runs.directory import RESUMED
 from simpel_cli.runs.finding import ASIDE
 from simpel_cli.runs.interruption import interruption, stop_if
 from simpel_cli.runs.lock import is_locked
@@ -90,7 +89,7 @@ def _begun(job: Job) -> bool:
         record = read_manifest(job.directory)
     except ConfigError:
         return False
-    if job.verb in RESUMED and record.get("status") in ("running", "interrupted"):
+    if job.verb in RESUMES and record.get("status") in ("running", "interrupted"):
         with contextlib.suppress(ConfigError):  # a configuration that this version cannot read is another one
             if not _changed(job):
                 return True

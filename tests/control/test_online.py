@@ -31,6 +31,7 @@ from simpel_cli.control.plants.policy_files import contract, load_policy, save_p
 from simpel_cli.control.plants.returned_episodes import ReturnedEpisodes
 from simpel_cli.control.plants.runner import PolicyRunner
 from simpel_cli.control.posterior_world import world_of_posterior
+from simpel_cli.control.rounds import own_data
 from simpel_cli.control.task import Task
 from simpel_cli.control.world import true_world
 from simpel_cli.data import Measurements, read
@@ -570,3 +571,12 @@ def test_a_rig_of_a_users_own(tmp_path: Path) -> None:
     again = simpel(tmp_path, *words, "online.episodes=2", "policy.steps=8000", "hydra.run.dir=run")
     assert again.code == 2
     assert "holds a run already. Go on with `simpel rl-online --resume run`" in again.err
+
+
+def test_keys_of_the_data_that_episodes_have_no_use_for_are_not_looked_at(tmp_path: Path) -> None:
+    """`data=sergio` has the layout `transitions`, in which past inputs are not known; episodes of a plant are trajectories."""
+    words = ("rl-online", "experiment=pendulum_swing_up", "+data.stack_actions=1", "+data.layout=transitions")
+    result = simpel(tmp_path, *words, "world=gymnasium")
+    assert (result.code, "data.layout" in result.err) == (2, True)  # typed, it is named
+    config = {"data": {"path": "rows.parquet", "layout": "transitions", "stack_actions": 1, "noise_std": {"phi": 0.1}}}
+    assert own_data(config) == {"path": [], "stack_actions": 1, "noise_std": {"phi": 0.1}}

@@ -161,6 +161,16 @@ def test_numpy_predicts_what_the_posterior_does(fitted: Path, tmp_path: Path) ->
     assert found["std"]["omega"] == pytest.approx((following[:, 1].var() + noise[2] ** 2) ** 0.5, rel=1e-4)
 
 
+def test_what_is_not_exported_need_not_be_installed(fitted: Path, tmp_path: Path) -> None:
+    shutil.copytree(fitted, tmp_path / "run")
+    config = load(tmp_path / "run" / "config.yaml")
+    config["run"]["plugins"], config["score"]["_target_"] = ["gone"], "gone.Score"
+    (tmp_path / "run" / "config.yaml").write_text(json.dumps(config))
+    result = simpel(tmp_path, "export", "run", "--out", "out")
+    assert (result.code, result.err) == (0, "")
+    assert (tmp_path / "out" / "posterior.safetensors").exists()
+
+
 def test_the_simulator_that_discover_corrected(fitted: Path, tmp_path: Path) -> None:
     run = tmp_path / "found"
     (run / "conf" / "sim").mkdir(parents=True)

@@ -14,8 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import FIT, PATIENCE, TINY, environment, rows, simpel, start
 
+from simpel_cli.config.compose import Job
 from simpel_cli.errors import ConfigError
+from simpel_cli.runs.directory import RESUMED
 from simpel_cli.runs.lock import is_locked, locked
+from simpel_cli.sweeps.job import _begun
+from simpel_cli.sweeps.verbs import RESUMES
 from simpel_cli.sweeps.workers import Options
 
 # long enough to be killed amid it; the same job several times, so that each says what the others should have come to
@@ -280,3 +284,18 @@ def workers_of(parent: int) -> list[int]:
         found += [int(pid) for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert found, "no worker process"
     return found
+
+
+def test_messages_name_the_verbs_that_are_resumed() -> None:
+    assert set(RESUMES) == set(RESUMED)
+
+
+@pytest.mark.parametrize("status", ["running", "interrupted", "failed"])
+def test_a_job_of_another_version_is_set_aside(tmp_path: Path, status: str) -> None:
+    run = tmp_path / "0"
+    run.mkdir()
+    (run / "config.yaml").write_text("prior: {_target_: simpel_cli.prior.SimulatorPrior}\n")
+    (run / "manifest.json").write_text(json.dumps({"command": "fit", "status": status}))  # its format is 1
+    assert not _begun(Job({}, run, tmp_path))
+    assert not (run / "manifest.json").exists()
+    assert (tmp_path / "0.failed-1" / "config.yaml").exists()
