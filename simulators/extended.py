@@ -13,6 +13,7 @@ from simulators.quantity import (
     check_keys,
     check_model_name,
     check_spelling,
+    read_between_rows,
     read_number,
     read_term,
     read_times,
@@ -39,7 +40,7 @@ class Extended:
         name: letters, digits and single underscores.
         base: node of the simulator that the terms are added to.
         parameters: name: {unit, range, prior} or a number.
-        inputs: input: {value: expression in its place, delay, lag}, each if there is one; see `Declared`.
+        inputs: input: {value: expression in its place, delay, lag, between_rows}, each if there is one; see `Declared`.
         dynamics: state: expression that is added to its rate, in states, inputs, parameters, and rate_STATE for the rate that
             the simulator itself has.
 
@@ -79,7 +80,7 @@ class Extended:
         _known("inputs", self.inputs, base.inputs)
         _known("dynamics", self.dynamics, base.states)
         for name, node in self.inputs.items():
-            check_keys(f"sim.inputs.{name}", node, ("value", *TIMES))
+            check_keys(f"sim.inputs.{name}", node, ("value", *TIMES, "between_rows"))
         params = (*base.params, *own)
         values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
 
@@ -110,6 +111,7 @@ class Extended:
             output=lambda x, u, p: base.output(x, given(known(x, u, p)), p[: len(base.params)]),
             fixed=base.fixed | fixed,
             coordinates=None if self.dynamics or values else base.coordinates,
+            between_rows=base.between_rows | read_between_rows(self.inputs),
             **late,
         )
         model.function()  # reads every expression once, so that an error surfaces here and not at first use

@@ -24,6 +24,7 @@ from simulators.quantity import (
     check_mapping,
     check_model_name,
     check_spelling,
+    read_between_rows,
     read_expression,
     read_limits,
     read_number,
@@ -93,7 +94,7 @@ class Model:
         dt: duration of one transition, s.
         substeps: RK4 steps per transition.
         states: dx of them; the rows of x and of `rhs`.
-        inputs: du of them; the rows of u, held constant over a transition.
+        inputs: du of them; the rows of u.
         params: dp uncertain parameters; the rows of p. Known numbers are constants inside `rhs`.
         outputs: measured quantities that are not states; the rows of `output`.
         rhs: (x, u, p) -> d(state)/dt, dx rows.
@@ -102,6 +103,8 @@ class Model:
         fixed: the known numbers by name, for the reader and for reports.
         delay: input: how much later it acts than it is recorded, s, or the parameter that says so.
         lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
+        between_rows: input: `held` over a transition at the value of its row, or `linear`, straight to the value of the next
+            row. Held where nothing is said.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
         coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
@@ -121,6 +124,7 @@ class Model:
     fixed: dict[str, float] = field(default_factory=dict)
     delay: dict[str, float | str] = field(default_factory=dict)
     lag: dict[str, float | str] = field(default_factory=dict)
+    between_rows: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
@@ -130,6 +134,12 @@ class Model:
         high = {q.name: q.high for q in self.params} | self.fixed
         ends = [[high[v] if isinstance(v, str) else v for v in times.values()] for times in (self.delay, self.lag)]
         return max(ends[0], default=0.0) + 3 * max(ends[1], default=0.0)
+
+    @property
+    def linear(self) -> tuple[int, ...]:
+        """Rows of the inputs that go straight from a row to the next: a transition depends on their next values, too."""
+        named = [self.between_rows.get(q.name) == "linear" for q in self.inputs]
+        return tuple(i for i, linear in enumerate(named) if linear and self.states)
 
     def past(self) -> int:
         """Return the number of inputs before its own that a transition depends on."""
@@ -186,7 +196,7 @@ class Declared:
         states: name: {unit, range: [low, high], periodic: false, limits: [low, high]}; none for a static function. What
             leaves the `limits` is put back after each Runge-Kutta step (null: no limit), e.g. a level that cannot be negative.
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
-            slowly an input acts.
+            slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
         dynamics: state: expression of its time derivative, in states, inputs and parameters.
@@ -225,7 +235,10 @@ class Declared:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
         states = tuple(read_variable(f"sim.states.{name}", name, node, LIMITS) for name, node in self.states.items())
-        inputs = tuple(read_variable(f"sim.inputs.{name}", name, node, TIMES) for name, node in self.inputs.items())
+        inputs = tuple(
+            read_variable(f"sim.inputs.{name}", name, node, (*TIMES, "between_rows"))
+            for name, node in self.inputs.items()
+        )
         outputs = tuple(read_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
         if not states and not outputs:
             raise ModelError(
@@ -260,6 +273,7 @@ class Declared:
             fixed=fixed,
             delay=read_times("delay", self.inputs, params, fixed),
             lag=read_times("lag", self.inputs, params, fixed),
+            between_rows=read_between_rows(self.inputs),
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },

@@ -11,6 +11,7 @@ from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, 
 
 PRIORS = ("uniform", "normal", "lognormal")
 TIMES = ("delay", "lag")  # of an input
+BETWEEN_ROWS = ("held", "linear")  # what an input does from one row to the next
 LIMITS = ("limits",)  # of a state
 
 
@@ -181,6 +182,16 @@ def read_times(
         found[name] = value if isinstance(value, str) else least
         if least < 0:
             raise ModelError(f"{path}: {least:g} s is negative; an input cannot act before it is given")
+    return found
+
+
+def read_between_rows(inputs: Mapping[str, Any]) -> dict[str, str]:
+    """Read what the inputs do between rows, of those that say so: `held`, or `linear`."""
+    found = {}
+    for name, node in inputs.items():
+        if "between_rows" in node:
+            check_word(f"sim.inputs.{name}.between_rows", node["between_rows"], BETWEEN_ROWS)
+            found[name] = node["between_rows"]
     return found
 
 

@@ -46,7 +46,7 @@ class Assignment(NamedTuple):
     @property
     def memory(self) -> int:
         """Past commands that a policy sees."""
-        return max(self.encoding.stack, int(self.goal.uses_before))
+        return max(self.encoding.memory, int(self.goal.uses_before))
 
 
 def assignment(declared: Declared) -> Assignment:

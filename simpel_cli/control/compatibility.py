@@ -39,6 +39,14 @@ def check_compatible(
             if its.periodic != own.periodic:
                 one, two = (("an angle" if q.periodic else "no angle") + " (periodic)" for q in (its, own))
                 raise ConfigError(f"{key}: {name} of {other.name} is {one}; that of sim is {two}.")
+    for i, q in enumerate(encoding.inputs):
+        ways = [
+            i in encoding.linear,
+            isinstance(other, Model) and q.name in [other.inputs[k].name for k in other.linear],
+        ]
+        if ways[0] != ways[1]:
+            one, two = ("linear" if way else "held" for way in ways)
+            raise ConfigError(f"{key}: {q.name} of {other.name} is {two} between rows; that of sim is {one}.")
     if not math.isclose(other.dt, dt, rel_tol=1e-6):
         raise ConfigError(f"{key}: a step of {other.name} is {other.dt:g} s; one of sim is {dt:g} s.")
     takes = {q.name: q for q in other.inputs}

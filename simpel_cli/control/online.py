@@ -179,7 +179,9 @@ def _episode(run: OnlineRun, plant: Plant, number: int, screen: Screen) -> None:
     trained = time.perf_counter()
     run.check()
     if not path.exists():
-        write_episode(path, plant.episode(number, folder / "policy"), run.asked.encoding, run.asked.source.dt)
+        write_episode(
+            path, plant.episode(number, folder / "policy"), run.asked.encoding, run.asked.source.dt, run.asked.goal.rest
+        )
     problem = why_unusable(run, number, path)
     facts = {
         "return_in_model": float(trained_policies.model_returns[0]),
@@ -253,10 +255,10 @@ def _trained(run: OnlineRun, number: int, model: Learned, folder: Path) -> Train
 
 def _surprise(run: OnlineRun, number: int, model: Learned) -> float:
     """Return the negative log-likelihood per transition of an episode under the model before it is trained on it."""
-    study = model.study
+    study, encoding = model.study, model.study.system.encoding
     try:
         recording = recorded(run, [run.episode_file(number)])
-        x, y = ev.test_arrays(transitions(recording.train, study.system.encoding.stack), study.system.encoding)
+        x, y = ev.test_arrays(transitions(recording.train, encoding.stack, encoding.linear), encoding)
     except DataError:  # the episode is too short
         return float("nan")
     posterior = posteriors(study, model.fitted, model.state)[0]

@@ -137,7 +137,7 @@ def refuse_unusable(run: OnlineRun, number: int, episode: PlantEpisode) -> None:
             )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"episode_{number:03d}.parquet"
-        write_episode(path, episode, run.asked.encoding, run.asked.source.dt)
+        write_episode(path, episode, run.asked.encoding, run.asked.source.dt, run.asked.goal.rest)
         if problem := why_unusable(run, number, path):
             raise DataError(f"{path.name}: {problem}")
 

@@ -1,6 +1,6 @@
 """A world that a policy acts in: a simulator or a learned model, B episodes at once.
 
-    y = follow(x),   x = [encoded state, past commands, command],   next state = advance(state, y)
+    y = follow(x),   x = [encoded state, inputs that the commands made],   next state = advance(state, y)
 
 States are kept in the encoding of the learning problem; what is observed is the encoded state, with sensor noise in a true
 world, and the last commands. In a learned model the state is what sensors would show: its noise is part of the model.
@@ -79,7 +79,7 @@ def world_of(
         noise_std: of the sensors, physical; None: the state is what they show.
         multiple: of B.
     """
-    memory = max(encoding.stack, int(goal.uses_before))
+    memory = max(encoding.memory, int(goal.uses_before))
     dim_u = len(encoding.inputs)
 
     def reset(key: PRNGKeyArray, n: int) -> Situation:
@@ -100,9 +100,8 @@ def world_of(
 
     def step(key: PRNGKeyArray, situation: Situation, action: Float[Array, "B du"]) -> Step:
         command = goal.command(action.astype(situation.encoded.dtype))
-        n = len(command)
-        stacked = jnp.concatenate([situation.past[:, memory - encoding.stack :], command[:, None]], axis=1)
-        x = jnp.concatenate([situation.encoded, stacked.reshape(n, -1)], axis=1)
+        commands = jnp.concatenate([situation.past[:, memory - encoding.memory :], command[:, None]], axis=1)
+        x = jnp.concatenate([situation.encoded, encoding.driven(commands)], axis=1)
         after = encoding.advance(situation.encoded, follow(key, x).astype(x.dtype))
         before = situation.past[:, -1] if memory else command
         judged = goal.judge(encoding.decode(after), command, before)
@@ -184,8 +183,8 @@ def beginning_at(
         key_task, key_rows, key_share = jax.random.split(key, 3)
         fresh = world.reset(key_task, n)
         at = x[jax.random.randint(key_rows, (n,), 0, count, jnp.int32)].astype(fresh.encoded.dtype)
-        stacked = at[:, encoding.dim_state :].reshape(n, encoding.stack + 1, len(encoding.inputs))
-        past = stacked[:, :-1] if world.memory == encoding.stack else fresh.past
+        known = world.memory == encoding.memory
+        past = encoding.commands(at[:, encoding.dim_state :]) if known else fresh.past
         measured = jax.random.bernoulli(key_share, share, (n,)) & (count > 0)
         return Situation(
             jnp.where(measured[:, None], at[:, : encoding.dim_state], fresh.encoded),

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simpel_cli.errors import ConfigError, did_you_mean
+from simulators.quantity import BETWEEN_ROWS
 
 LAYOUTS = ("trajectories", "transitions")
 CHOICES = ("random", "first")
@@ -25,7 +26,8 @@ class Measurements:
         episode: column that names the episode of a row. Without it, the file is one episode.
         columns: quantity of the simulator -> column; null = not measured; left out = a column of the same name.
         computed: new column -> formula in columns of the file, e.g. `{v: vx*cos(theta) + vy*sin(theta)}`.
-        split: `{column: name}` with the values train and test (other values are left out and counted), or
+        split: `{column: name}` with the values train and test (other values are left out and counted; `test: [names]` where the
+            test is called otherwise), or
             `{test_files: [test.csv]}`: these of the files in `path` to test on, the others to train on, or
             `{test_fraction: 0.25, by: episode|time}`: whole episodes, or the last fraction of each episode; 0: all is
             trained on and nothing judged. A single
@@ -45,6 +47,8 @@ class Measurements:
             of what they are resampled to.
         derived: states whose column was computed from another column, e.g. a speed that was differentiated from the
             position: `discover` does not take them for measurements. A plain difference is found without this.
+        between_rows: input -> `held` at the value of its row until the next, or `linear`, straight to the value of the next
+            row; in place of what the simulator says. Held where neither says anything (`discover` then compares both).
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
@@ -67,6 +71,7 @@ class Measurements:
     stack_actions: int = 0
     max_gap: float | int | None = None
     derived: tuple[str, ...] = ()
+    between_rows: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not all(isinstance(path, str) and path for path in self.paths):
@@ -81,6 +86,8 @@ class Measurements:
         _whole("stack_actions", self.stack_actions, 0)
         for name, std in self.noise_std.items():
             _positive(f"noise_std.{name}", std)
+        for name, word in self.between_rows.items():
+            _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
         _check_split(self.split)
         if self.layout == "transitions" and self.stack_actions:
             raise ConfigError(
@@ -115,7 +122,7 @@ class Measurements:
 
         Args:
             quantities: names of all states, inputs and outputs.
-            measurable: names of the states and outputs, which can have noise.
+            measurable: names of the states and outputs, which can have noise; the others are inputs.
 
         Raises:
             ConfigError: a key that the simulator does not have.
@@ -125,6 +132,7 @@ class Measurements:
             ("units", self.units, quantities),
             ("noise_std", self.noise_std, measurable),
             ("derived", self.derived, measurable),
+            ("between_rows", self.between_rows, tuple(name for name in quantities if name not in measurable)),
         ):
             for name in names:
                 if name not in allowed:
@@ -155,12 +163,17 @@ def _whole(key: str, value: Any, least: int) -> None:
 
 
 def _check_split(split: Mapping[str, Any]) -> None:
-    forms = "{column: <name>}, {test_files: [<file>]} or {test_fraction: 0.25, by: episode|time}"
-    allowed = ("column", "test_files", "test_fraction", "by")
+    forms = "{column: <name>, test: [<value>]}, {test_files: [<file>]} or {test_fraction: 0.25, by: episode|time}"
+    allowed = ("column", "test", "test_files", "test_fraction", "by")
     for key in split:
         if key not in allowed:
             raise ConfigError(f"data.split.{key}: no such key, only {forms}.{did_you_mean(key, list(allowed))}")
-    if not split or (len(split) > 1 and ("column" in split or "test_files" in split)):
+    others = set(split) - {"column", "test"} if "column" in split else set(split) - {"test_files"}
+    if (
+        not split
+        or (others and ("column" in split or "test_files" in split))
+        or ("test" in split and "column" not in split)
+    ):
         raise ConfigError(f"data.split: {dict(split)} is not allowed, only {forms}.")
     if "test_files" in split:
         files = split["test_files"]
@@ -170,6 +183,11 @@ def _check_split(split: Mapping[str, Any]) -> None:
     if "column" in split:
         if not isinstance(split["column"], str):
             raise ConfigError(f"data.split.column: {split['column']!r} is not the name of a column.")
+        test = split.get("test", ["test"])
+        if not (isinstance(test, list | tuple) and test and all(isinstance(name, str) and name for name in test)):
+            raise ConfigError(
+                f"data.split.test: {test!r} is not a list of values of the column, e.g. [test_slow, test_fast]."
+            )
         return
     fraction = split.get("test_fraction", SPLIT_DEFAULT["test_fraction"])
     if not (_is_number(fraction) and 0 <= fraction < 1):

@@ -19,8 +19,8 @@ from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.tables.locate import by_file, locate
 from simpel_cli.data.tables.table import read_table
 from simpel_cli.data.time_gaps import cut_at_gaps
-from simpel_cli.errors import DataError
-from simulators.model import Quantity
+from simpel_cli.errors import ConfigError, DataError
+from simulators.model import Model, Quantity
 
 
 def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True) -> Recording:
@@ -46,6 +46,13 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     measurable = (*model.states, *model.outputs)
     quantities = (*measurable, *model.inputs)
     config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
+    linear = model.linear if isinstance(model, Model) else ()
+    if linear and config.layout == "transitions":
+        name = model.inputs[linear[0]].name
+        raise ConfigError(
+            f"data.between_rows.{name}: linear, but the next value of an input is not known in layout 'transitions', whose "
+            "rows do not follow each other. Store trajectories, or set it to held."
+        )
     paths = tuple(locate(path, base) for path in config.paths)
     table = with_computed(read_table(paths), config.computed)
     mapping = map_columns(config, model, table)
@@ -100,7 +107,9 @@ def _trajectories(
     noise = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
     gain = 1.0
     if config.resample is not None:
-        episodes, gain, check = resample(episodes, raw, config.resample)
+        episodes, gain, check = resample(
+            episodes, raw, config.resample, model.linear if isinstance(model, Model) else ()
+        )
         report.append(check)
     # the slope of a spline is smooth already: the filter takes nothing more from it
     noise = {name: std * gain for name, std in noise.items()} | {

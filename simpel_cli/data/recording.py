@@ -31,7 +31,7 @@ class Episode(NamedTuple):
     name: str
     time: np.ndarray  # (T,) s
     states: np.ndarray  # (T, n_states)
-    inputs: np.ndarray  # (T, n_inputs), held from a row to the next
+    inputs: np.ndarray  # (T, n_inputs)
     outputs: np.ndarray  # (T, n_measured_outputs)
     next_states: np.ndarray | None = None  # (T, n_states) where rows do not follow each other (layout: transitions)
 
@@ -53,14 +53,16 @@ class Transitions(NamedTuple):
     """One-step pairs, float64, physical units, not encoded."""
 
     states: np.ndarray  # (n, ds)
-    inputs: np.ndarray  # (n, (stack + 1) * du), past inputs (oldest first), then the current one
+    inputs: (
+        np.ndarray
+    )  # (n, (stack + 1) * du + linear), past inputs (oldest first), the current ones, the next linear ones
     next_states: np.ndarray  # (n, ds)
     outputs: np.ndarray  # (n, dy_out), at the row of the inputs
     episode: np.ndarray  # (n,) index of the episode
     row: np.ndarray  # (n,) row in the episode
 
 
-def transitions(episodes: Sequence[Episode], stack_actions: int) -> Transitions:
+def transitions(episodes: Sequence[Episode], stack_actions: int, linear: Sequence[int] = ()) -> Transitions:
     """Cut episodes into transitions; none crosses from one episode into another.
 
     Without states (a static model) every row that has its past inputs is one.
@@ -68,27 +70,29 @@ def transitions(episodes: Sequence[Episode], stack_actions: int) -> Transitions:
     Args:
         episodes: at least one.
         stack_actions: number of past inputs to carry along; the first so many rows of an episode have no such past.
+        linear: inputs that go straight from a row to the next, whose next values are carried along, too.
 
     Raises:
         DataError: no episode is long enough.
     """
     if not episodes:
         raise DataError("no transition: there is no episode.")
-    parts = [_of_episode(index, episode, stack_actions) for index, episode in enumerate(episodes)]
+    parts = [_of_episode(index, episode, stack_actions, linear) for index, episode in enumerate(episodes)]
     joined = Transitions(*(np.concatenate(column) for column in zip(*parts, strict=True))) if parts else None
     if joined is None or len(joined.row) == 0:
         raise DataError(f"no transition: none of {len(parts)} episodes has {stack_actions + 2} rows in a row.")
     return joined
 
 
-def no_transitions(source: Source, outputs: int, stack_actions: int) -> Transitions:
+def no_transitions(source: Source, outputs: int, stack_actions: int, linear: Sequence[int] = ()) -> Transitions:
     """Return no transition at all, of a simulator with so many measured outputs."""
-    states, inputs = np.empty((0, len(source.states))), np.empty((0, (stack_actions + 1) * len(source.inputs)))
+    width = (stack_actions + 1) * len(source.inputs) + len(linear)
+    states, inputs = np.empty((0, len(source.states))), np.empty((0, width))
     nothing = np.empty(0, int)
     return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing)
 
 
-def _of_episode(index: int, episode: Episode, stack: int) -> Transitions:
+def _of_episode(index: int, episode: Episode, stack: int, linear: Sequence[int]) -> Transitions:
     length, n_states = episode.states.shape
     if episode.next_states is not None:
         rows, following = np.arange(length), episode.next_states
@@ -96,10 +100,12 @@ def _of_episode(index: int, episode: Episode, stack: int) -> Transitions:
         rows, following = np.arange(stack, length), episode.states[stack:]
     else:
         rows, following = np.arange(stack, length - 1), episode.states[stack + 1 :]
-    past_to_now = [episode.inputs[rows - back] for back in range(stack, -1, -1)]
+    stacked = [episode.inputs[rows - back] for back in range(stack, -1, -1)]
+    if linear:  # of rows that do not follow each other the next inputs are not known: `read` refuses them
+        stacked.append(episode.inputs[np.minimum(rows + 1, length - 1)][:, list(linear)])
     return Transitions(
         states=episode.states[rows],
-        inputs=np.concatenate(past_to_now, axis=1),
+        inputs=np.concatenate(stacked, axis=1),
         next_states=following,
         outputs=episode.outputs[rows],
         episode=np.full(len(rows), index),

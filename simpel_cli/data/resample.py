@@ -2,11 +2,13 @@
 
 What swings faster than half the new rate would appear as a slow motion that is not there. So states and outputs pass
 a zero-phase low-pass filter (windowed sinc, 60 dB) first, then every k-th row is kept, or a cubic spline is read where
-k is not whole. Inputs are held in the simulator, so theirs is the mean over the new interval, which keeps the impulse.
+k is not whole. Of an input that is held between rows it is the mean over the new interval, which keeps the impulse; one that
+is linear passes the same filter as the states, so that a linear system stays as it is.
 
 Reference: Oppenheim and Schafer, Discrete-Time Signal Processing (Kaiser window design, 2010, section 7.5).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +29,7 @@ class Resampled(NamedTuple):
     check: Check
 
 
-def resample(episodes: tuple[Episode, ...], raw: float, dt: float) -> Resampled:
+def resample(episodes: tuple[Episode, ...], raw: float, dt: float, linear: Sequence[int] = ()) -> Resampled:
     """Bring every episode to `dt`.
 
     The filter sees measured rows only: where it would reach past an end, rows are dropped (`HALF_WIDTH` at either end).
@@ -36,13 +38,14 @@ def resample(episodes: tuple[Episode, ...], raw: float, dt: float) -> Resampled:
         episodes: contiguous rows about `raw` apart, angles unwrapped.
         raw: dt of the data, s.
         dt: wanted, s.
+        linear: inputs that go straight from a row to the next; the others are held.
 
     Returns:
         The episodes with at least two rows, in order, and what was done.
     """
     # a filter longer than every episode leaves nothing, however long: it need not be built in full
     taps = lowpass(min(dt / raw, max((len(episode.time) for episode in episodes), default=1)))
-    brought = tuple(_one(episode, raw, dt, taps) for episode in episodes)
+    brought = tuple(_one(episode, raw, dt, taps, list(linear)) for episode in episodes)
     kept = tuple(episode for episode in brought if len(episode.time) > 1)
     lost = len(brought) - len(kept)
     if len(taps) == 1:
@@ -72,9 +75,11 @@ def lowpass(ratio: float) -> np.ndarray:
     return np.asarray(firwin(2 * half + 1, CUTOFF / ratio, window=("kaiser", kaiser_beta(ATTENUATION))), dtype=float)
 
 
-def _one(episode: Episode, raw: float, dt: float, taps: np.ndarray) -> Episode:
-    n_states = episode.states.shape[1]
-    time, values = _equidistant(episode.time, np.concatenate([episode.states, episode.outputs], axis=1), raw)
+def _one(episode: Episode, raw: float, dt: float, taps: np.ndarray, linear: list[int]) -> Episode:
+    n_states, n_outputs = episode.states.shape[1], episode.outputs.shape[1]
+    time, values = _equidistant(
+        episode.time, np.concatenate([episode.states, episode.outputs, episode.inputs[:, linear]], axis=1), raw
+    )
     if len(time) <= len(taps):  # less than two rows would be left
         return Episode(episode.name, *(column[:0] for column in episode[1:5]))
     half = len(taps) // 2
@@ -90,7 +95,8 @@ def _one(episode: Episode, raw: float, dt: float, taps: np.ndarray) -> Episode:
         grid = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt * (1 + 1e-9) + 1e-6) + 1)
         time, values = grid, _spline(time, values, grid)
     inputs = _interval_means(episode.time, episode.inputs, time, dt, raw)
-    return Episode(episode.name, time, values[:, :n_states], inputs, values[:, n_states:])
+    inputs[:, linear] = values[:, n_states + n_outputs :]
+    return Episode(episode.name, time, values[:, :n_states], inputs, values[:, n_states : n_states + n_outputs])
 
 
 def _whole(ratio: float) -> bool:

@@ -18,6 +18,15 @@ from simpel_cli.discovery.measurements.cleaning import cleaned, outlier_check
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
+from simpel_cli.discovery.search.between_rows import (
+    LINEAR,
+    Preference,
+    in_words,
+    preferences,
+    sentence_of,
+    settled,
+    words_of,
+)
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.held_out_gate import Gate
@@ -58,6 +67,7 @@ class Searched(NamedTuple):
         disturbance: a force that goes with time alone; None: there is none.
         windows: held-out ones.
         recording: the measurements that were searched in, with what was found in them.
+        between_rows: input -> what it does between rows, where neither simulator nor data say.
     """
 
     search: Search
@@ -67,6 +77,7 @@ class Searched(NamedTuple):
     disturbance: Disturbance | None
     windows: Windows
     recording: Recording
+    between_rows: dict[str, Preference]
 
 
 def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
@@ -110,6 +121,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
+    declared = _with_linear_inputs(declared, searched.between_rows)
     if found["effects"]:
         found |= _correct(declared, searched, found, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
@@ -138,37 +150,56 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     rows = sum(len(e.time) for e in recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    plan = attach(kept=shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal))
+    plan = shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal)
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
     assessor = Assessor(plan, options.horizon)
-    search, base, windows, clean = calibrated(plan, fitter, assessor, clean, terminal)
-    outliers = outlier_check(clean, plan.augmented.measured)
+    found = calibrated(plan, fitter, assessor, clean, terminal)
+    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    again = preferences(found.search, selection.chosen) if selection.chosen.terms else found.between_rows
+    if words_of(again) != words_of(found.between_rows):
+        terminal.line(f"beside these effects {in_words(again)}: searching once more", "inputs")
+        plan = plan._replace(start=settled(found.search, again))
+        found = calibrated(plan, fitter, Assessor(plan, options.horizon), clean, terminal, again)
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    search, windows, between_rows = found.search, found.test, again
+    outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
-    selection, gates = accepted(search, assessor, base, options, terminal)
     levels = NoiseProfile(search, assessor, selection.chosen)
     selection, gates = with_interactions(levels, selection, gates, attach, options, terminal)
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
     recording = recording._replace(checks=(*recording.checks, outliers))
-    return Searched(search, assessor, selection, gates, disturbance, windows, recording)
+    return Searched(search, assessor, selection, gates, disturbance, windows, recording, between_rows)
 
 
 def _verdict(searched: Searched, before: Assessment, after: Assessment, began: float) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
-    search, assessor, selection, gates, disturbance, windows, recording = searched
+    search, assessor, selection, gates, disturbance, windows, recording, between_rows = searched
     left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
     seconds = time.perf_counter() - began
     found = verdict_of(
         search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
     )
+    found["between_rows"] = {name: p._asdict() for name, p in between_rows.items()}
     found["steps"] = steps_of(search, selection, assessor, windows)
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
-    found["summary"] += caveats(found)
+    found["summary"] += sentence_of(between_rows) + caveats(found)
     return found
+
+
+def _with_linear_inputs(declared: Declared, found: dict[str, Preference]) -> Declared:
+    """Return the configuration whose data say which inputs are linear, so that whatever follows takes them so."""
+    linear = {name: p.word for name, p in found.items() if p.word == LINEAR}
+    data = declared.config["data"]
+    return (
+        declared.changed(data=data | {"between_rows": (data.get("between_rows") or {}) | linear})
+        if linear
+        else declared
+    )
 
 
 def _correct(

@@ -23,7 +23,7 @@ def divergence_error(
     bad = ~np.isfinite(values).all(axis=2)
     draw = int(bad.sum(axis=1).argmax())
     states, stacked = encoding.split_x(x)
-    inputs = stacked[:, stacked.shape[1] - len(encoding.inputs) :]
+    inputs = encoding.inputs_now(stacked)
     reach = np.concatenate([_reach(states, encoding.states), _reach(inputs, encoding.inputs)], axis=1).max(axis=1)
     point = int(np.where(bad[draw], reach, np.inf).argmin())
     start = "; ".join(

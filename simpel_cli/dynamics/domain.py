@@ -22,9 +22,9 @@ class Domain:
     encoding: Encoding
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner in physical units, each (ds + (stack+1) du,)."""
+        """Lower and upper corner in physical units, each (ds + dim_inputs,)."""
         enc = self.encoding
-        quantities = [*enc.states, *(list(enc.inputs) * (enc.stack + 1))]
+        quantities = [*enc.states, *(list(enc.inputs) * (enc.stack + 1)), *(enc.inputs[i] for i in enc.linear)]
         return np.array([q.low for q in quantities]), np.array([q.high for q in quantities])
 
     def sample(self, key: PRNGKeyArray, n: int, dtype: DTypeLike) -> Float[Array, "n dx"]:

@@ -1,6 +1,6 @@
 """Coordinates of the learning problem: angles as (sin, cos), past actions stacked, differences as targets.
 
-    x = [enc(state), past actions (oldest first), action]
+    x = [enc(state), past actions (oldest first), action, next actions of the inputs that are linear between rows]
     y = [enc(next state) - enc(state), measured outputs]
 
 Everything here is numpy-like and works on numpy and on JAX arrays, single points or batches (last axis = features).
@@ -25,12 +25,14 @@ class Encoding:
         inputs: the inputs of the model.
         outputs: measured quantities that are not states.
         stack: number of past actions in x.
+        linear: inputs that go straight from a row to the next; a transition depends on their next values, too.
     """
 
     states: tuple[Quantity, ...]
     inputs: tuple[Quantity, ...]
     outputs: tuple[Quantity, ...] = ()
     stack: int = 0
+    linear: tuple[int, ...] = ()
 
     @property
     def dim_state(self) -> int:
@@ -40,7 +42,12 @@ class Encoding:
     @property
     def dim_x(self) -> int:
         """Number of network inputs, dx."""
-        return self.dim_state + (self.stack + 1) * len(self.inputs)
+        return self.dim_state + self.dim_inputs
+
+    @property
+    def dim_inputs(self) -> int:
+        """Number of stacked inputs."""
+        return (self.stack + 1) * len(self.inputs) + len(self.linear)
 
     @property
     def dim_y(self) -> int:
@@ -94,13 +101,71 @@ class Encoding:
         return xp.stack(parts, axis=-1) if parts else encoded
 
     def to_x(self, states: Any, inputs: Any) -> Any:
-        """Network input (..., dx) from physical states (..., ds) and stacked inputs (..., (stack+1) du)."""
+        """Network input (..., dx) from physical states (..., ds) and stacked inputs (..., dim_inputs)."""
         xp = np if isinstance(states, np.ndarray) else jnp
         return xp.concatenate([self.encode(states), inputs], axis=-1)
 
     def split_x(self, x: Any) -> tuple[Any, Any]:
-        """Physical states (..., ds) and stacked inputs (..., (stack+1) du) of network inputs (..., dx)."""
+        """Physical states (..., ds) and stacked inputs (..., dim_inputs) of network inputs (..., dx)."""
         return self.decode(x[..., : self.dim_state]), x[..., self.dim_state :]
+
+    def inputs_now(self, stacked: Any) -> Any:
+        """Inputs (..., du) of the row in question, of stacked ones (..., dim_inputs)."""
+        du = len(self.inputs)
+        return stacked[..., self.stack * du : (self.stack + 1) * du]
+
+    def input_rows(self, stacked: Any) -> Any:
+        """Stacked inputs (..., dim_inputs) row by row, oldest first, (..., R, du).
+
+        R = stack + 1; one more where an input is linear, with the next values of the linear ones (the others repeat theirs).
+        """
+        xp = np if isinstance(stacked, np.ndarray) else jnp
+        du, rows = len(self.inputs), self.stack + 1
+        own = stacked[..., : rows * du].reshape(*stacked.shape[:-1], rows, du)
+        if not self.linear:
+            return own
+        last = [
+            stacked[..., rows * du + self.linear.index(i)] if i in self.linear else own[..., -1, i] for i in range(du)
+        ]
+        return xp.concatenate([own, xp.stack(last, axis=-1)[..., None, :]], axis=-2)
+
+    def stacked(self, rows: Any) -> Any:
+        """Stack inputs (..., dim_inputs) of so many rows that `input_rows` has, (..., R, du)."""
+        xp = np if isinstance(rows, np.ndarray) else jnp
+        own = rows[..., : self.stack + 1, :]
+        flat = own.reshape(*own.shape[:-2], -1)
+        return xp.concatenate([flat, rows[..., -1, list(self.linear)]], axis=-1) if self.linear else flat
+
+    @property
+    def memory(self) -> int:
+        """Past commands that a transition depends on.
+
+        A command is what a held input takes at once and keeps, and what a linear one reaches at the next row: where one is
+        linear, its value at the row in question is the command of the row before.
+        """
+        return self.stack + bool(self.linear)
+
+    def driven(self, commands: Any) -> Any:
+        """Stack inputs (..., dim_inputs) of commands (..., memory + 1, du), oldest first, the last one given now."""
+        if not self.linear:
+            return self.stacked(commands)
+        xp = np if isinstance(commands, np.ndarray) else jnp
+        held, linear = commands[..., 1:, :], commands[..., :-1, :]
+        now = xp.where(self._is_linear(held.ndim), linear, held)
+        return self.stacked(xp.concatenate([now, commands[..., -1:, :]], axis=-2))
+
+    def commands(self, stacked: Any) -> Any:
+        """Commands (..., memory, du) before the row in question, of stacked inputs; of what is not known the oldest."""
+        xp = np if isinstance(stacked, np.ndarray) else jnp
+        rows = self.input_rows(stacked)[..., : self.stack + 1, :]
+        if not self.linear:
+            return rows[..., :-1, :]
+        held = xp.concatenate([rows[..., :1, :], rows[..., :-1, :]], axis=-2)
+        return xp.where(self._is_linear(held.ndim), rows, held)
+
+    def _is_linear(self, axes: int) -> np.ndarray:
+        """Mask of the linear inputs along the last of so many axes."""
+        return np.isin(np.arange(len(self.inputs)), self.linear).reshape((1,) * (axes - 1) + (-1,))
 
     def to_y(self, states: Any, next_states: Any, outputs: Any) -> Any:
         """Target (..., dy): difference of the encoded states, then the measured outputs."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from simpel_cli.dynamics.casadi_jax import checked
 from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.dynamics.input_delay import delayed_inputs
+from simpel_cli.dynamics.input_delay import delayed_inputs, prompt_inputs
 from simpel_cli.dynamics.integrate import State, rk4_step
 from simpel_cli.errors import ConfigError
 from simulators.model import Model, Quantity
@@ -46,7 +46,8 @@ class Transition(NamedTuple):
 def encoding_of(model: Model | World, outputs: tuple[str, ...] = (), stack: int = 0) -> Encoding:
     """Return the coordinates of a model whose named outputs are measured."""
     measured = tuple(q for q in model.outputs if q.name in outputs)
-    return Encoding(states=model.states, inputs=model.inputs, outputs=measured, stack=stack)
+    linear = model.linear if isinstance(model, Model) else ()
+    return Encoding(states=model.states, inputs=model.inputs, outputs=measured, stack=stack, linear=linear)
 
 
 def transition(model: Model, encoding: Encoding) -> Transition:
@@ -65,7 +66,6 @@ def transition(model: Model, encoding: Encoding) -> Transition:
     # outputs are read off the whole function; a transition is integrated in the model's own coordinates
     measure = checked(model.function(), ranges) if encoding.outputs or not model.states else None
     integrated = _integrated(model, ranges) if model.states else None
-    n_inputs = len(model.inputs)
     rows = [[q.name for q in model.outputs].index(q.name) for q in encoding.outputs]
 
     needed = model.past()
@@ -82,21 +82,23 @@ def transition(model: Model, encoding: Encoding) -> Transition:
         return jnp.stack([jnp.asarray(values[v] if isinstance(v, str) else v, phi.dtype) for v in each])
 
     def follow(state: State, stacked: Float[Array, " su"], phi: Float[Array, " dp"]) -> State:
-        u = stacked[stacked.shape[0] - n_inputs :]
         assert integrated is not None
+        u = encoding.input_rows(stacked)
         if not (model.delay or model.lag):
-            return integrated(state, jnp.broadcast_to(u, (model.substeps, n_inputs)), phi)
+            return integrated(state, prompt_inputs(u[encoding.stack :], model.substeps, model.linear), phi)
         late = delayed_inputs(
-            stacked.reshape(encoding.stack + 1, n_inputs), seconds(model.delay, phi), seconds(model.lag, phi),
-            dt=model.dt, substeps=model.substeps, lead=encoding.stack,
+            u, seconds(model.delay, phi), seconds(model.lag, phi), dt=model.dt, substeps=model.substeps, lead=encoding.stack,
+            linear=model.linear,
         )  # fmt: skip
-
         return integrated(state, late[0], phi)
 
     def step(x: Float[Array, " dx"], phi: Float[Array, " dp"]) -> Float[Array, " dy"]:
         state, stacked = encoding.split_x(x)
-        u = stacked[stacked.shape[0] - n_inputs :]
-        outputs = measure(state, u, phi)[1][jnp.array(rows, int)] if measure is not None and rows else state[:0]
+        outputs = (
+            measure(state, encoding.inputs_now(stacked), phi)[1][jnp.array(rows, int)]
+            if measure is not None and rows
+            else state[:0]
+        )
         after = follow(state, stacked, phi) if model.states else state
         return encoding.to_y(state, after, outputs)
 
@@ -106,7 +108,7 @@ def transition(model: Model, encoding: Encoding) -> Transition:
 
 def _integrated(
     model: Model, ranges: list[list[tuple[float, float]]]
-) -> Callable[[State, Float[Array, "substeps du"], Float[Array, " dp"]], State]:
+) -> Callable[[State, Float[Array, "substeps K du"], Float[Array, " dp"]], State]:
     """Return the map (state, inputs of the substeps, phi) -> state dt later, checked against CasADi."""
     flow, h = model.flow(), model.dt / model.substeps
     states, inputs, params = ranges
@@ -117,11 +119,11 @@ def _integrated(
     rhs = checked(flow.rhs, [where, inputs, params])
     long = flow.rhs.class_name() == "SXFunction" and flow.rhs.n_instructions() > LONG
 
-    def integrated(state: State, u: Float[Array, "substeps du"], phi: Float[Array, " dp"]) -> State:
+    def integrated(state: State, u: Float[Array, "substeps K du"], phi: Float[Array, " dp"]) -> State:
         low, high = (jnp.array(ends, state.dtype) for ends in (flow.low, flow.high))
 
-        def one(z: State, u: Float[Array, " du"]) -> tuple[State, None]:
-            after = rk4_step(lambda z: rhs(z, u, phi)[0], z, h, scanned=long)
+        def one(z: State, u: Float[Array, "K du"]) -> tuple[State, None]:
+            after = rk4_step(lambda z, u: rhs(z, u, phi)[0], z, u, h, scanned=long)
             return jnp.clip(after, low, high) if flow.limited else after, None
 
         z = enter(state, phi)[0] if enter is not None else state

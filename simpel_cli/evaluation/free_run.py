@@ -49,7 +49,7 @@ def free_run(posterior: Posterior, encoding: Encoding, episodes: tuple[Episode, 
     if not starts or not encoding.states:
         return None
     measured = np.stack([episodes[e].states[s : s + horizon + 1] for e, s in starts])
-    inputs = np.stack([_stacked(episodes[e].inputs, s, horizon, k) for e, s in starts])  # (W, H, (k+1) du)
+    inputs = np.stack([_stacked(episodes[e].inputs, s, horizon, encoding) for e, s in starts])
     particles, noise = rollout(posterior, encoding, measured[:, 0], inputs)  # (H + 1, L, W, ds)
     mean, spread = _circular_moments(particles, encoding)
     std = np.sqrt(spread**2 + noise**2)
@@ -70,7 +70,7 @@ def rollout(
         posterior: the fitted posterior.
         encoding: coordinates.
         states: initial states, shape (W, ds).
-        inputs: stacked inputs, shape (W, H, (stack + 1) du).
+        inputs: stacked inputs, shape (W, H, dim_inputs).
 
     Returns:
         States of every particle (H + 1, L, W, ds), physical units, and the noise per state (ds,).
@@ -106,8 +106,10 @@ def _circular_moments(particles: np.ndarray, encoding: Encoding) -> tuple[np.nda
     return mean, std
 
 
-def _stacked(inputs: np.ndarray, start: int, horizon: int, k: int) -> np.ndarray:
-    return np.concatenate([inputs[start - k + j : start - k + j + horizon] for j in range(k + 1)], axis=1)
+def _stacked(inputs: np.ndarray, start: int, horizon: int, encoding: Encoding) -> np.ndarray:
+    first = start - encoding.stack
+    rows = range(first, first + encoding.stack + 1 + bool(encoding.linear))
+    return np.asarray(encoding.stacked(np.stack([inputs[row : row + horizon] for row in rows], axis=1)))
 
 
 def free_run_table(run: FreeRun, blocks: Blocks, encoding: Encoding, dt: float) -> list[dict[str, object]]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.dynamics.encoding import Encoding
+from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.errors import ConfigError
 from simpel_cli.export import predictor
 from simpel_cli.runs.arrays import load_checkpoint, write_arrays
@@ -55,8 +56,10 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
         "inputs": [{"name": q.name, "unit": q.unit} for q in encoding.inputs],
         "outputs": [{"name": q.name, "unit": q.unit} for q in encoding.outputs],
         "past_inputs": encoding.stack,
+        "next_inputs": [encoding.inputs[i].name for i in encoding.linear],
         "negative_slope": method.network.negative_slope,
-        "network_inputs": "every state in order, an angle as its sine and cosine; then the inputs, oldest first",
+        "network_inputs": "every state in order, an angle as its sine and cosine; then the inputs, oldest first; then those of "
+        "next_inputs one step later, which are linear between rows (the others are held)",
         "network_outputs": [
             {"name": name, "unit": unit, "kind": kind}
             for name, unit, kind in zip(encoding.y_names, encoding.y_units, encoding.y_kinds, strict=True)
@@ -74,9 +77,8 @@ def _encoding(declared: Declared, width: int) -> Encoding:
     """Return the coordinates that the networks have: which outputs were measured shows in the columns of the data."""
     source, measurements = declared.source, declared.measurements
     for measured in (source.outputs, tuple(q for q in source.outputs if q.name in measurements.columns)):
-        encoding = Encoding(
-            states=source.states, inputs=source.inputs, outputs=measured, stack=measurements.stack_actions
-        )
+        names = tuple(q.name for q in measured)
+        encoding = encoding_of(source, names, measurements.stack_actions)
         if encoding.dim_y == width:
             return encoding
     raise ConfigError(f"sim.outputs: which of them the networks predict cannot be known from {width} targets.")

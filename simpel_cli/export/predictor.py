@@ -7,7 +7,8 @@ now.members                          # (L, k): what each of the L networks says,
 course = predictor.run({"phi": 3.1, "omega": 0.0}, commands)    # (L, T + 1, states): every network on its own predictions
 
 Arrays do as well, rows of states and of inputs in the order of posterior.json; an input acts on past ones, too, where
-`past_inputs` is not 0: then inputs are rows of (past_inputs + 1) x inputs, oldest first.
+`past_inputs` is not 0: then inputs are rows of (past_inputs + 1) x inputs, oldest first. Inputs that are linear between rows
+(`next_inputs`) act with their next value, too, which follows in the row.
 """
 
 import json
@@ -91,7 +92,7 @@ class Predictor:
 
         Args:
             states: (L, n, ds) or (n, ds).
-            inputs: (n, (past_inputs + 1) du), oldest first.
+            inputs: (n, (past_inputs + 1) du + next_inputs), oldest first.
         """
         encoded = self.encode(np.asarray(states, float))
         inputs = np.asarray(inputs, float)
@@ -102,7 +103,11 @@ class Predictor:
         return self.decode(encoded + y[..., :width]), y[..., width:]
 
     def step(
-        self, state: dict[str, float], inputs: dict[str, float], past: list[dict[str, float]] | None = None
+        self,
+        state: dict[str, float],
+        inputs: dict[str, float],
+        past: list[dict[str, float]] | None = None,
+        following: dict[str, float] | None = None,
     ) -> Prediction:
         """Predict one step.
 
@@ -110,6 +115,7 @@ class Predictor:
             state: by name, in the units of posterior.json.
             inputs: that act now, by name.
             past: inputs of the steps before, oldest first; None: as now.
+            following: `next_inputs` one step later; None: as now.
 
         Raises:
             KeyError: a name is missing.
@@ -117,11 +123,12 @@ class Predictor:
         """
         s = np.array([[float(state[q["name"]]) for q in self.facts["states"]]])
         rows = [*(past if past is not None else [inputs] * self.facts["past_inputs"]), inputs]
-        u = np.array([[float(row[q["name"]]) for row in rows for q in self.facts["inputs"]]])
+        later = [float((following or inputs)[name]) for name in self.facts["next_inputs"]]
+        u = np.array([[*(float(row[q["name"]]) for row in rows for q in self.facts["inputs"]), *later]])
         if not (np.isfinite(s).all() and np.isfinite(u).all()):
             raise ValueError(f"not finite: {state}, {inputs}")
-        following, outputs = self.advance(s, u)
-        members = np.concatenate([following, outputs], axis=-1)[:, 0]
+        after, outputs = self.advance(s, u)
+        members = np.concatenate([after, outputs], axis=-1)[:, 0]
         mean, spread = members.mean(axis=0), members.var(axis=0)
         noise = self._noise(s)
         for i, angle in enumerate(self.angle):
@@ -140,15 +147,18 @@ class Predictor:
 
         Args:
             state: at the start.
-            commands: T of them; before the first, the first was held.
+            commands: T of them; before the first, the first was held, and after the last, the last.
         """
         s = np.array([[float(state[q["name"]]) for q in self.facts["states"]]])
         u = np.array([[float(row[q["name"]]) for q in self.facts["inputs"]] for row in commands])
         past = self.facts["past_inputs"]
         held = np.concatenate([np.repeat(u[:1], past, axis=0), u])
+        names = [q["name"] for q in self.facts["inputs"]]
+        later = [names.index(name) for name in self.facts["next_inputs"]]
         course = [np.broadcast_to(s, (len(self.noise_members()), *s.shape))]
         for t in range(len(u)):
-            course.append(self.advance(course[-1], held[t : t + past + 1].reshape(1, -1))[0])
+            now = np.concatenate([held[t : t + past + 1].ravel(), held[min(t + past + 1, len(held) - 1)][later]])
+            course.append(self.advance(course[-1], now[None])[0])
         return np.concatenate(course, axis=1)
 
     def _noise(self, states: np.ndarray) -> np.ndarray:

@@ -64,7 +64,9 @@ def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
         "x": described(model.states),
         "u": described(model.inputs),
         "past_inputs": model.past(),
-        "u_order": "inputs of the past_inputs steps before and of this one, oldest first",
+        "next_inputs": [model.inputs[i].name for i in model.linear],
+        "u_order": "inputs of the past_inputs steps before and of this one, oldest first; then next_inputs of the step after, "
+        "which are linear between rows (the others are held)",
         "p": parameters,
         "next": "x one dt later; an angle is not wrapped",
         "y": described(model.outputs),

@@ -82,7 +82,7 @@ def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) ->
         ConfigError: the world returned something that is not finite; names state, input and parameters.
     """
     states, stacked = encoding.split_x(x)
-    inputs = stacked[:, stacked.shape[1] - len(world.inputs) :]
+    inputs = encoding.inputs_now(stacked)
     phi = draw(world.params, np.random.default_rng(seed), n)
     m = len(x)
     after = world.step(np.tile(states, (n, 1)), np.tile(inputs, (n, 1)), np.repeat(phi, m, axis=0))

@@ -116,7 +116,9 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         lines.append(
             f"simpel fit --config-dir {typed(directory / 'conf')} sim={name} data={chosen.get('data', '')}{past}"
         )
-    lines.append(f"simpel fit{own} {what}          # with the declared simulator")
+    linear = [name for name, said in (found.get("between_rows") or {}).items() if said["word"] == "linear"]
+    said = f" 'data.between_rows={{{','.join(f'{name}:linear' for name in linear)}}}'" if linear else ""
+    lines.append(f"simpel fit{own} {what}{said}          # with the declared simulator")
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")
     return lines

@@ -1,16 +1,19 @@
 """Every group of a configuration as an object, built once; what comes after assembles them and builds nothing again."""
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from simpel_cli.config.build import build_groups, build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.data import Measurements, absolute
 from simpel_cli.data.recording import Source
+from simpel_cli.errors import ConfigError
 from simpel_cli.evaluation.settings import Evaluation
 from simpel_cli.inference.protocols import Method
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import Settings
+from simulators.model import Model
 
 
 class Declared(NamedTuple):
@@ -32,8 +35,18 @@ class Declared(NamedTuple):
 
     @property
     def source(self) -> Source:
-        """The simulator: a symbolic model, or a world with query access only."""
-        return self.groups["sim"]
+        """The simulator, a symbolic model or a world with query access only; data may say what inputs do between rows."""
+        found, data = self.groups["sim"], self.groups.get("data")
+        said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
+        if isinstance(found, Model):
+            return replace(found, between_rows=found.between_rows | said) if said else found
+        linear = [name for name, word in said.items() if word == "linear"]
+        if linear:
+            raise ConfigError(
+                f"data.between_rows.{linear[0]}: linear, but {found.name} is asked for single transitions, over which it holds "
+                "its inputs. Give held, or a simulator in symbols."
+            )
+        return found
 
     @property
     def measurements(self) -> Measurements:

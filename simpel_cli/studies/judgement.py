@@ -41,7 +41,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     horizon = study.evaluation.steps(dt)
     episodes = study.recording.test
     refuse_untested(study.recording)
-    pairs = transitions(episodes, encoding.stack)
+    pairs = transitions(episodes, encoding.stack, encoding.linear)
     x, y = ev.test_arrays(pairs, encoding)
     where = _places(study, episodes, pairs.episode, pairs.row)
     blocks = _blocks(study, episodes, where, horizon)

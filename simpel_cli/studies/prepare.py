@@ -43,13 +43,13 @@ class Fitted(NamedTuple):
 def prepare(study: Study) -> Fitted:
     """Choose the training transitions of every seed and assemble the problems."""
     settings, measurements = study.settings, study.measurements
-    source, stack = study.system.source, measurements.stack_actions
+    source, encoding = study.system.source, study.system.encoding
     recorded = study.recording.train
-    pairs = transitions(recorded, stack) if recorded else no_transitions(source, len(study.recording.outputs), stack)
+    carried = (encoding.stack, encoding.linear)
+    outputs = len(study.recording.outputs)
+    pairs = transitions(recorded, *carried) if recorded else no_transitions(source, outputs, *carried)
     training = [
-        test_arrays(
-            select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), study.system.encoding
-        )
+        test_arrays(select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), encoding)
         for seed in settings.all_seeds
     ]
     # one normaliser for all seeds and all n_train: results stay comparable

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import casadi
 
 from simulators.effects.structure import structure
-from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR, EffectParameter, Term
+from simulators.effects.term import INPUT, NAMED, RATE, SENSOR, EffectParameter, Term
 from simulators.effects.vehicle import PARTS, Vehicle, vehicle
 from simulators.expression import RESERVED, parse
 from simulators.model import Model, ModelError
@@ -78,11 +78,11 @@ class Expression:
         if not self.places:
             raise ModelError(f"{where}.acts_on: empty; name a role ({', '.join(ROLES)}) or quantities of the simulator")
         if bool(self.term) == bool(self.operator):
-            raise ModelError(f"{where}: give either `term` or `operator` ({', '.join(OPERATORS)})")
-        if self.operator and (self.operator not in OPERATORS or len(self.parameters) != 1):
+            raise ModelError(f"{where}: give either `term` or `operator` ({', '.join(NAMED)})")
+        if self.operator and (self.operator not in NAMED or len(self.parameters) != 1):
             raise ModelError(
                 f"{where}.operator: {self.operator!r} with {len(self.parameters)} parameters; allowed are "
-                f"{', '.join(OPERATORS)} with one parameter"
+                f"{', '.join(NAMED)} with one parameter"
             )
         parts = list(self.term) if isinstance(self.term, Mapping) else []
         if bool(parts) != (PLANAR in self.places) or not set(parts) <= set(PARTS) or (parts and len(self.places) > 1):

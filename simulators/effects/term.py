@@ -5,9 +5,11 @@ from typing import NamedTuple
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
-ON_INPUT = (DELAY, LAG, BACKLASH)
+BETWEEN_ROWS = "between_rows"  # a share of the way from an input that is held to one that is linear
+ON_INPUT = (DELAY, LAG, BACKLASH, BETWEEN_ROWS)
 ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
 OPERATORS = (*ON_INPUT, *ON_SENSOR)
+NAMED = tuple(kind for kind in OPERATORS if kind != BETWEEN_ROWS)  # that an effect may state: the other is no effect
 
 
 class EffectParameter(NamedTuple):

@@ -49,14 +49,17 @@ class RK4:
             )
         return self.follow(states, inputs[:, None], params)
 
-    def follow(self, states: np.ndarray, history: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Integrate n queries over dt, late inputs exactly: between two arrivals all are constant.
+    def follow(
+        self, states: np.ndarray, history: np.ndarray, params: np.ndarray, following: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Integrate n queries over dt, late inputs exactly: between two arrivals all are constant, or straight lines.
 
         Args:
             states: (n, dx).
-            history: (n, past + 1, du) inputs, oldest first, each held for dt; the last one is given now. Before it the
-                oldest was held.
+            history: (n, past + 1, du) inputs, oldest first, each held for dt or linear to the next; the last one is given now.
+                Before it the oldest was held.
             params: (n, dp).
+            following: (n, du) inputs dt later, to which those go that are linear between rows; None: they stay.
 
         Returns:
             The states dt later, (n, dx), not wrapped.
@@ -71,14 +74,21 @@ class RK4:
         z = np.asarray(states, float)
         if self._flow.enter is not None:
             z = _evaluate(self._flow.enter, z, p)
-        newest = history.shape[1] - 1
+        newest, linear = history.shape[1] - 1, list(self.model.linear)
+        known = np.concatenate([history, (history[:, -1] if following is None else following)[:, None]], axis=1)
         for k in range(edges.shape[1] - 1):
             begin, length = edges[:, k], edges[:, k + 1] - edges[:, k]
             if not length.any():
                 continue
             back = np.minimum(whole + (begin[:, None] < part), newest).astype(int)
-            u = np.take_along_axis(history, newest - back[:, None, :], axis=1)[:, 0]
-            z = self._hold(z, u, p, length * self.model.dt)
+            u, after = (np.take_along_axis(known, newest + k - back[:, None, :], axis=1)[:, 0] for k in (0, 1))
+            ends = []
+            for time in (begin, begin + length):  # of a straight line: where it is at both ends of the piece
+                passed = time[:, None] - part + (begin[:, None] < part)
+                at = u.copy()
+                at[:, linear] += (np.minimum(passed, 1.0) * (after - u))[:, linear]
+                ends.append(at)
+            z = self._along(z, ends[0], ends[1], p, length * self.model.dt)
         return z if self._flow.leave is None else _evaluate(self._flow.leave, z, p)
 
     def measure(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
@@ -103,15 +113,20 @@ class RK4:
             late[:, i] = params[:, names.index(own)] if isinstance(own, str) else own
         return np.maximum(late, 0.0)  # a normal prior has draws beyond its range
 
-    def _hold(self, z: np.ndarray, u: np.ndarray, p: np.ndarray, duration: np.ndarray) -> np.ndarray:
-        """Integrate (n, dz) with constant inputs (n, du), each query for its own duration (n,), s."""
+    def _along(
+        self, z: np.ndarray, first: np.ndarray, last: np.ndarray, p: np.ndarray, duration: np.ndarray
+    ) -> np.ndarray:
+        """Integrate (n, dz) with inputs (n, du) on a straight line, each query for its own duration (n,), s."""
         h = (duration / self.model.substeps)[:, None]
         low, high = np.array(self._flow.low), np.array(self._flow.high)
-        for _ in range(self.model.substeps):
-            k1 = _evaluate(self._flow.rhs, z, u, p)
-            k2 = _evaluate(self._flow.rhs, z + h / 2 * k1, u, p)
-            k3 = _evaluate(self._flow.rhs, z + h / 2 * k2, u, p)
-            k4 = _evaluate(self._flow.rhs, z + h * k3, u, p)
+        for step in range(self.model.substeps):
+            begin, middle, end = (
+                first + (step + share) / self.model.substeps * (last - first) for share in (0.0, 0.5, 1.0)
+            )
+            k1 = _evaluate(self._flow.rhs, z, begin, p)
+            k2 = _evaluate(self._flow.rhs, z + h / 2 * k1, middle, p)
+            k3 = _evaluate(self._flow.rhs, z + h / 2 * k2, middle, p)
+            k4 = _evaluate(self._flow.rhs, z + h * k3, end, p)
             z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             if self._flow.limited:
                 z = np.clip(z, low, high)

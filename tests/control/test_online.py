@@ -101,7 +101,7 @@ def test_an_episode_is_read_as_it_was_written(swing: tuple[Any, Encoding, Task],
     noise = jnp.full(2, 0.05, jnp.float32)
     world = true_world(encoding, goal, transition(model, encoding).step, phi, noise)
     ride = Simulated(world, encoding, goal, actor.act, HORIZON, jax.random.key(3)).episode(0, tmp_path)
-    write_episode(tmp_path / "000.parquet", ride, encoding, model.dt)
+    write_episode(tmp_path / "000.parquet", ride, encoding, model.dt, (0.0,) * len(encoding.inputs))
     asked = Measurements(path=(str(tmp_path / "000.parquet"),), time="t", split={"test_fraction": 0})
     recording = read(asked, model, tmp_path, 0)
     assert recording.test == ()

@@ -154,7 +154,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
         louder=pytest.fail,
         flow=lambda p, x, u: a @ x + b + 0.0 * p[0] + 0.0 * jnp.sum(u),
         measure=lambda p, x, u: x,
-        delayed_inputs=lambda p, u: u[:, None, :],
+        delayed_inputs=lambda p, u: u[:, None, None, :],
     )
     known = np.array([False])
     coordinates = Coordinates(np.zeros(1), np.ones(1), known, known, (1, 0, 0), (), len(b))

@@ -13,7 +13,7 @@ U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
 
 def arrived(delay: float, lag: float, u: np.ndarray = U) -> np.ndarray:
     out = delayed_inputs(jnp.asarray(u), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
-    return np.asarray(out)[..., 0]
+    return np.asarray(out)[:, :, 0, 0]
 
 
 def staircase(t: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_a_play_comes_before_delay_and_lag() -> None:
         jnp.asarray(U), jnp.array([0.137]), jnp.array([0.2]), dt=DT, substeps=SUBSTEPS, lead=LEAD,
         half_play=jnp.array([0.4]),
     )  # fmt: skip
-    np.testing.assert_allclose(np.asarray(both)[..., 0], arrived(0.137, 0.2, played(0.4)[:, None]), rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(both)[:, :, 0, 0], arrived(0.137, 0.2, played(0.4)[:, None]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("half", [0.0, 0.3])
@@ -113,7 +113,7 @@ def test_a_delay_of_whole_rows_is_that_however_it_is_compiled(rows: int) -> None
     late = jnp.full(2, rows * 0.1 / 3, jnp.float32)
 
     def arrived(u: jax.Array, delay: jax.Array) -> jax.Array:
-        return delayed_inputs(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0]
+        return delayed_inputs(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0, :, 0]
 
     found = jax.jit(jax.vmap(arrived, in_axes=(0, None)))(inputs, late)
     np.testing.assert_allclose(found, np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=5e-6)

@@ -1,6 +1,6 @@
 """A plant: the system itself, which a policy drives for one episode at a time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -174,19 +174,25 @@ class Stepped:
         return PlantEpisode(np.array(measured), np.array(commands), reward, good)
 
 
-def write_episode(path: Path, episode: PlantEpisode, encoding: Encoding, dt: float) -> None:
-    """Write an episode as measurements; of the last row, whose command nobody saw, the command is repeated.
+def write_episode(path: Path, episode: PlantEpisode, encoding: Encoding, dt: float, rest: Sequence[float]) -> None:
+    """Write an episode as measurements: of every row the states and the inputs there.
+
+    A held input is the command that is given there, and of the last row, whose command nobody saw, the one before. An input
+    that is linear between rows has reached the command of the row before, and begins at rest.
 
     Args:
         path: of the Parquet file.
         episode: the episode.
         encoding: names and units.
         dt: s, between rows.
+        rest: commands that nobody gave, (du,).
     """
-    held = np.concatenate([episode.commands, episode.commands[-1:]])
+    inputs = np.concatenate([episode.commands, episode.commands[-1:]])
+    inputs[1:, list(encoding.linear)] = episode.commands[:, list(encoding.linear)]
+    inputs[0, list(encoding.linear)] = np.array(rest)[list(encoding.linear)]
     columns: dict[str, Any] = {"t": np.arange(len(episode.states)) * dt}
     columns |= {q.name: episode.states[:, i].astype(float) for i, q in enumerate(encoding.states)}
-    columns |= {q.name: held[:, i].astype(float) for i, q in enumerate(encoding.inputs)}
+    columns |= {q.name: inputs[:, i].astype(float) for i, q in enumerate(encoding.inputs)}
     columns |= {
         "reward": np.append(episode.reward, 0.0).astype(float),
         "good": np.append(episode.good, episode.good[-1]),

@@ -24,10 +24,17 @@ def contract(encoding: Encoding, goal: Goal, memory: int, dt: float) -> dict[str
         "dt": dt,
         "states": [{"name": q.name, "unit": q.unit, "angle": q.periodic} for q in encoding.states],
         "commands": [
-            {"name": q.name, "unit": q.unit, "low": low, "high": high}
-            for q, low, high in zip(encoding.inputs, goal.low, goal.high, strict=True)
+            {
+                "name": q.name,
+                "unit": q.unit,
+                "low": low,
+                "high": high,
+                "between_rows": "linear" if i in encoding.linear else "held",
+            }
+            for i, (q, low, high) in enumerate(zip(encoding.inputs, goal.low, goal.high, strict=True))
         ],
         "past_commands": memory,
+        "between_rows": "held: applied at once and kept for dt; linear: reached dt later, along a straight line",
         "observation": "every state in order, an angle as its sine and cosine; then the past commands, oldest first",
         "action": "tanh of the first half of the network's outputs, from [-1, 1] onto [low, high]",
     }

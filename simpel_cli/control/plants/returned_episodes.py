@@ -58,7 +58,17 @@ class ReturnedEpisodes:
         self._in_time(table, path, rows)
         states = np.stack([self._column(table, path, q.name, rows) for q in self.encoding.states], axis=1)
         # of the last row nobody sees what its command led to, so that a rig need not know it
-        commands = np.stack([self._column(table, path, q.name, rows - 1) for q in self.encoding.inputs], axis=1)
+        # an input that is linear between rows has reached the command of a row at the next
+        linear = self.encoding.linear
+        commands = np.stack(
+            [
+                self._column(table, path, q.name, rows)[1:]
+                if i in linear
+                else self._column(table, path, q.name, rows - 1)
+                for i, q in enumerate(self.encoding.inputs)
+            ],
+            axis=1,
+        )
         low, high = np.array(self.goal.low), np.array(self.goal.high)
         beyond = (commands < low - 1e-3 * (high - low)) | (commands > high + 1e-3 * (high - low))
         if beyond.any():

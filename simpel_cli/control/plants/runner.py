@@ -4,6 +4,9 @@ runner = PolicyRunner("policy")
 command = runner.command({"phi": 3.1, "omega": 0.0})     # every dt seconds; a dict of commands in physical units
 runner.reset()                                           # at the start of every episode
 
+A command whose `between_rows` is held is applied at once and kept until the next; one that is linear is reached dt later, along
+a straight line.
+
 As a program it reads a JSON object of states per line and answers with one of commands, or with {"error": ...} where the line
 is none; an empty line starts a new episode:
 

@@ -31,7 +31,8 @@ from simpel_cli.discovery.likelihood.derivatives import Moving, Value, movable, 
 from simpel_cli.discovery.likelihood.sensor_delay import back, echo, no_jumps, pushed
 from simpel_cli.discovery.likelihood.small_matrices import along, apart, product
 from simpel_cli.dynamics.input_delay import delayed_inputs
-from simulators.effects.term import BACKLASH, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
+from simpel_cli.dynamics.integrate import at_stages
+from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
 
 class Noise(NamedTuple):
@@ -70,9 +71,10 @@ class Filter(NamedTuple):
         moved: (moving, noise, track, held, y, ok, u, start, spread) -> innovations and variances: to be differentiated in
             what moves.
         louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
-        flow: (p, x, u of the substeps) -> x one row later.
+        flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
-        delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, nu).
+        delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
+            and end.
     """
 
     track: Callable[..., tuple[Track, Held]]
@@ -80,7 +82,7 @@ class Filter(NamedTuple):
     louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
-    delayed_inputs: Callable[..., Float[Array, "T substeps nu"]]
+    delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
 
 
 SMALL = 3  # states of a model whose covariance follows the parameters
@@ -101,8 +103,8 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     model = augmented.model
     key = (
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
-        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag, substeps,
-        lead,
+        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag, model.linear,
+        substeps, lead,
     )  # fmt: skip
     if key not in _KEPT:
         _KEPT[key] = _filter_of(augmented, substeps, lead)
@@ -122,7 +124,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     h = dt / substeps
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
-    delays, lags, plays = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH))
+    delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
+    # where it is asked whether an input is linear, a share of the way from held says so
+    linear = tuple(sorted({*model.linear, *(signal for signal, _ in shares)}))
+    said = tuple(float(i in model.linear) for i in range(nu))
     sensor_delays, sensor_lags = (augmented.operators[kind] for kind in (SENSOR_DELAY, SENSOR_LAG))
 
     def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
@@ -133,14 +138,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     def inputs(p: Array, u: Array) -> Array:
         times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
-        widths = (per_signal(p, plays, nu),) if plays else ()
+        more = {"half_play": per_signal(p, plays, nu)} if plays else {}
+        if linear:
+            more["share"] = per_signal(p, shares, nu, said)
+            u = jnp.concatenate([u, u[-1:]])  # nothing is predicted from the last row of a window
 
-        def one(u: Array, delay: Array, lag: Array, *play: Array) -> Array:
-            return delayed_inputs(
-                u, delay, lag, dt=dt, substeps=substeps, lead=lead, half_play=play[0] if play else None
-            )
+        def one(u: Array, delay: Array, lag: Array, more: dict[str, Array]) -> Array:
+            return delayed_inputs(u, delay, lag, dt=dt, substeps=substeps, lead=lead, linear=linear, **more)
 
-        return _over_points(one, p.ndim - 1)(u, *times, *widths)
+        return _over_points(one, p.ndim - 1)(u, *times, more)
 
     # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
     stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
@@ -151,32 +157,32 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         def step(carry: tuple[Array, Array], u: Array) -> tuple[tuple[Array, Array], None]:
             x, before = carry
 
-            def stage(carry: tuple[Array, Array], weights: Array) -> tuple[tuple[Array, Array], None]:
-                total, slope = carry
+            def stage(carry: tuple[Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+                (total, slope), (weights, u) = carry, now
                 slope = moving_rates(x + h * weights[0] * slope, u, given)
                 return (total + h * weights[1] * slope, slope), None
 
-            return jax.lax.scan(stage, (x, before), stages)[0], None
+            return jax.lax.scan(stage, (x, before), (stages, at_stages(u)))[0], None
 
         return jax.lax.scan(step, (x, jnp.zeros_like(x)), u)[0]
 
     def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
 
-        def stage(carry: Any, weights: Array) -> tuple[Any, None]:
-            x, phi, u, total, total_phi, slope, slope_phi, _ = carry
+        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, None]:
+            (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
             slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
             slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
             after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
-            return (x, phi, u, after, after_phi, slope, slope_phi, rate_x), None
+            return (x, phi, after, after_phi, slope, slope_phi, rate_x), None
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
         def step(carry: Any, u: Array) -> tuple[Any, None]:
             x, phi, *_ = carry
-            end = jax.lax.scan(stage, (x, phi, u, x, phi, *nothing, nothing[1]), stages)[0]
-            return (end[3], end[4], end[5], end[7]), None
+            end = jax.lax.scan(stage, (x, phi, x, phi, *nothing, nothing[1]), (stages, at_stages(u)))[0]
+            return (end[2], end[3], end[4], end[6]), None
 
         return jax.lax.scan(step, (x, unit, *nothing), u)[0]
 
@@ -221,7 +227,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             # the sensor is read at the row: what arrived up to it is the last substep before
             h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps)
             if late_ones:
-                jumps = pushed(jumps, prompt, rate, rates(x, u_k[0], p)[0])
+                jumps = pushed(jumps, prompt, rate, rates(x, u_k[0, 0], p)[0])
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
@@ -240,15 +246,16 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
             held = Held(jnp.stack(gains), prompt, rate_x)
-            carry = following, after(cov, jacobian, half), u_k[-1], rate_after, rate_x_after, jumps
+            carry = following, after(cov, jacobian, half), u_k[-1, -1], rate_after, rate_x_after, jumps
             return carry, (out, held)
 
-        begin = (start, of_start(spread), u_sub[0, 0], *rates(start, u_sub[0, 0], p), no_jumps(ny, start))
+        first = u_sub[0, 0, 0]
+        begin = (start, of_start(spread), first, *rates(start, first, p), no_jumps(ny, start))
         return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
 
     def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
         """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
-        slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0], u[-1]), strict=True)), jnp.zeros(()))
+        slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0, 0], u[-1, -1]), strict=True)), jnp.zeros(()))
         change = dt / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
         return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
 
@@ -264,7 +271,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             if late_ones:
                 late = late_by(given.p)
                 read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
-                jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0], given))
+                jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0, 0], given))
             off = wrapped(y_k - read)
             errors, variances = [], []
             for j in range(ny):
@@ -281,10 +288,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             following, rate = flow(given, x, u_k)
             if bend is not None:
                 cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), half)
-            return (following, cov, u_k[-1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
+            return (following, cov, u_k[-1, -1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
 
-        first = moving_rates(start, u_sub[0, 0], given)
-        begin = (start, of_start(spread), u_sub[0, 0], first, no_jumps(ny, start))
+        first = u_sub[0, 0, 0]
+        begin = (start, of_start(spread), first, moving_rates(start, first, given), no_jumps(ny, start))
         return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
 
     def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:

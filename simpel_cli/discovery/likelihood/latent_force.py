@@ -117,7 +117,7 @@ class Forces:
     def inputs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
         """Return the inputs as they arrive, (W, T, nu), the mean of every row."""
         p, _ = self.coordinates.physical(jnp.asarray(z))
-        return np.asarray(self._arriving(p, jnp.asarray(windows.u))).mean(axis=2)
+        return np.asarray(self._arriving(p, jnp.asarray(windows.u))).mean(axis=(2, 3))
 
     def following(self, z: np.ndarray, state: np.ndarray, windows: Windows) -> np.ndarray:
         """Return where the model takes every state, (W, T, nx), in one row."""

@@ -143,7 +143,7 @@ def _window(
     def from_row(x: Array, k: Array) -> Array:
         end = jax.lax.scan(step, x, k + jnp.arange(horizon))[0]
         last = jnp.minimum(k + horizon - 1, rows - 1)
-        return rule.measure(p, end, u_sub[last, -1])
+        return rule.measure(p, end, u_sub[last, -1, -1])
 
     reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
     ahead = jnp.concatenate([y[:horizon], reached])[:rows]
@@ -151,7 +151,7 @@ def _window(
     def run(x: Array, k: Array) -> tuple[Array, Array]:
         # up to SETTLE the filter's state, from there on the model alone
         x = jnp.where(k <= SETTLE, track.mean[k], x)
-        read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1])
+        read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1, -1])
         return rule.flow(p, x, u_sub[k]), read
 
     free = jax.lax.scan(run, start, jnp.arange(rows))[1]

@@ -14,7 +14,7 @@ from simpel_cli.discovery.measurements.integration_steps import substeps_needed
 from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, thinned, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
-from simulators.effects.term import BACKLASH, DELAY, LAG
+from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, EffectParameter
 from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
@@ -81,7 +81,8 @@ def setup(
     scales = scales_of(model, recording.train, measured, recording.outputs)
     every = terms_of(model, recording, effects, pairs=pairs)
     added = {key_of(t) for t in extra}
-    terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)] + list(extra)
+    terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)]
+    terms += [*extra, *questions(model)]
     augmented = augment(model, terms, measured)
     # of all of them, so that windows do not depend on what is kept
     longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.parameters), default=0.0)
@@ -143,6 +144,19 @@ def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], 
     # what is late already is calibrated: a second delay of the same input could not be distinguished from the first
     late = {DELAY: model.delay, LAG: model.lag}
     return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
+
+
+def questions(model: Model) -> list[Term]:
+    """Return one term per input of which nothing is said: the share of the way from held to linear between rows."""
+    share = EffectParameter("", "share", "1", 0.0, 1.0, 0.0, (1.0,))
+    return [
+        Term(
+            "linear_input", q.name, BETWEEN_ROWS, "", (share._replace(name=f"linear_input_{q.name}_share"),),
+            "an input that goes straight from a row to the next",
+        )
+        for q in model.inputs
+        if q.name not in model.between_rows and model.states
+    ]  # fmt: skip
 
 
 def key_of(term: Term) -> Key:

@@ -13,6 +13,7 @@ from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.errors import DataError
+from simulators.effects.term import BETWEEN_ROWS
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -61,7 +62,8 @@ class Search:
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
-        self.banned: set[int] = set()  # terms that are no candidates
+        # terms that are no candidates: what an input does between rows is decided beforehand
+        self.banned = {t for t, term in enumerate(self.terms) if term.kind == BETWEEN_ROWS}
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
