@@ -10,16 +10,17 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 
-from simulators.expression import did_you_mean
 from simulators.model import Model, ModelError, Quantity
 from simulators.parameters import draw
-from simulators.quantity import check_word
+from simulators.quantity import check_word, refuse_unknown
 from simulators.worlds.excitation import Excitation, HeldRandom
+from simulators.worlds.motion import check_finite, on_rows
 from simulators.worlds.rk4 import RK4
+from simulators.worlds.sensors import Sensors, wrapped
+from simulators.worlds.streams import Streams
 from simulators.worlds.world import World
 
 OWN_COLUMNS = ("episode", "t", "split")
@@ -140,12 +141,17 @@ class Simulate:
             )
         return Simulation(columns, self._card(source, truth, columns))
 
-    def _stream(self, name: str, episode: int = 0) -> np.random.Generator:
-        return np.random.default_rng([self.seed, crc32(name.encode()), episode])
+    @property
+    def _streams(self) -> Streams:
+        return Streams(self.seed)
+
+    @property
+    def _sensors(self) -> Sensors:
+        return Sensors(self._streams, self.noise_std)
 
     def _truth(self, source: Model | World) -> np.ndarray:
         """Return the parameter vector (dp,); what is given replaces a draw and leaves the other draws as they were."""
-        drawn = draw(source.params, self._stream("params"), 1)[0]
+        drawn = draw(source.params, self._streams.of("params"), 1)[0]
         return np.array([self.truth.get(q.name, value) for q, value in zip(source.params, drawn, strict=True)])
 
     def _trajectories(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
@@ -153,22 +159,9 @@ class Simulate:
         inputs = np.zeros((n, steps, len(source.inputs)))
         for i, quantity in enumerate(source.inputs):
             for k in range(n):
-                stream = self._stream(f"input.{quantity.name}", k)
+                stream = self._streams.of(f"input.{quantity.name}", k)
                 inputs[k, :, i] = self.excitation.signal(stream, steps, source.dt, quantity)
-        params = np.tile(truth, (n, 1))
-        states = np.zeros((n, steps, len(source.states)))
-        states[:, 0] = self._initial(source)
-        model = RK4(source) if isinstance(source, Model) else None
-        past = model.past(params) if model is not None else 0
-        given = np.concatenate(
-            [np.repeat(inputs[:, :1], past, axis=1), inputs], axis=1
-        )  # the first one was held before
-        for j in range(1, steps):
-            if model is not None:
-                states[:, j] = model.follow(states[:, j - 1], given[:, j - 1 : j + past], params)
-            elif not isinstance(source, Model):
-                states[:, j] = source.step(states[:, j - 1], inputs[:, j - 1], params)
-            self._check_finite(source, states[:, j], j)
+        states = on_rows(source, self._initial(source), inputs, np.tile(truth, (n, 1)))
         columns = {"episode": np.repeat(np.arange(n), steps), "t": np.tile(source.dt * np.arange(steps), n)}
         for i, quantity in enumerate(source.states):
             columns[quantity.name] = self._measured(quantity, states[:, :, i])
@@ -182,28 +175,28 @@ class Simulate:
         n = self.episodes * self.steps
         ranges = [self._initial_range(q) for q in source.states]
         before = np.column_stack([
-            self._stream(f"initial.{q.name}").uniform(*ends, n) for q, ends in zip(source.states, ranges, strict=True)
+            self._streams.of(f"initial.{q.name}").uniform(*ends, n) for q, ends in zip(source.states, ranges, strict=True)
         ])  # fmt: skip
         inputs = np.zeros((n, len(source.inputs)))
         for i, q in enumerate(source.inputs):
-            inputs[:, i] = self._stream(f"input.{q.name}").uniform(q.low, q.high, n)
+            inputs[:, i] = self._streams.of(f"input.{q.name}").uniform(q.low, q.high, n)
         params = np.tile(truth, (n, 1))
         step = RK4(source).step if isinstance(source, Model) else source.step
         after = step(before, inputs, params)
-        self._check_finite(source, after, 1)
+        check_finite(source, after, source.dt)
         columns = {}
         for i, q in enumerate(source.states):
-            now = before[None, :, i]
-            columns[q.name] = self._measured(q, now, scale=1.0 if self.noise_on == "both" else 0.0)
-            columns[f"next_{q.name}"] = self._measured(q, after[None, :, i], stream="next_noise")
-            columns[f"exact_next_{q.name}"] = self._measured(q, after[None, :, i], scale=0.0)
+            now = before[:, i]
+            columns[q.name] = self._sensors.read(q, now) if self.noise_on == "both" else wrapped(q, now)
+            columns[f"next_{q.name}"] = self._sensors.read(q, after[:, i], stream="next_noise")
+            columns[f"exact_next_{q.name}"] = wrapped(q, after[:, i])
         columns |= {q.name: inputs[:, i] for i, q in enumerate(source.inputs)}
         return columns | self._outputs(source, (before, inputs, params), (1, n))
 
     def _static(self, source: Model | World, truth: np.ndarray) -> dict[str, np.ndarray]:
         """Rows of inputs uniform on their ranges, and the outputs there."""
         n = self.episodes * self.steps
-        columns = {q.name: self._stream(f"input.{q.name}").uniform(q.low, q.high, n) for q in source.inputs}
+        columns = {q.name: self._streams.of(f"input.{q.name}").uniform(q.low, q.high, n) for q in source.inputs}
         inputs = np.column_stack(list(columns.values())) if columns else np.zeros((n, 0))
         return columns | self._outputs(source, (np.zeros((n, 0)), inputs, np.tile(truth, (n, 1))), (1, n))
 
@@ -221,7 +214,7 @@ class Simulate:
         for i, quantity in enumerate(source.states):
             low, high = self._initial_range(quantity)
             for k in range(self.episodes):
-                start[k, i] = self._stream(f"initial.{quantity.name}", k).uniform(low, high)
+                start[k, i] = self._streams.of(f"initial.{quantity.name}", k).uniform(low, high)
         return start
 
     def _initial_range(self, quantity: Quantity) -> tuple[float, float]:
@@ -237,25 +230,9 @@ class Simulate:
             )
         return float(ends[0]), float(ends[1])
 
-    def _check_finite(self, source: Model | World, states: np.ndarray, j: int) -> None:
-        bad = np.argwhere(~np.isfinite(states))
-        if len(bad):
-            k, i = bad[0]
-            raise ModelError(
-                f"simulation: {source.states[i].name} of {source.name} is {states[k, i]} at t = {j * source.dt:g} s of "
-                f"episode {k}; narrow simulation.initial or the inputs, or give {source.name} smaller steps"
-            )
-
-    def _measured(
-        self, quantity: Quantity, values: np.ndarray, stream: str = "noise", scale: float = 1.0
-    ) -> np.ndarray:
-        """Add noise to the values (episodes, steps) of one quantity, wrap angles to [-pi, pi); one value per row."""
-        std = scale * self.noise_std.get(quantity.name, 0.0)
-        noise = [self._stream(f"{stream}.{quantity.name}", k).normal(size=values.shape[1]) for k in range(len(values))]
-        noisy = (values + std * np.array(noise)).ravel()
-        if quantity.periodic:
-            noisy = (noisy + np.pi) % (2 * np.pi) - np.pi
-        return noisy
+    def _measured(self, quantity: Quantity, values: np.ndarray) -> np.ndarray:
+        """Return what is recorded of the values (episodes, steps) of one quantity; one value per row."""
+        return np.concatenate([self._sensors.read(quantity, exact, k) for k, exact in enumerate(values)])
 
     def _split(self, groups: np.ndarray) -> np.ndarray:
         n = int(groups[-1]) + 1
@@ -307,5 +284,4 @@ def _known(key: str, given: Iterable[str], quantities: tuple[Quantity, ...]) -> 
     names = [quantity.name for quantity in quantities]
     for name in given:
         if name not in names:
-            known, hint = ", ".join(names) or "none", did_you_mean(name, names)
-            raise ModelError(f"simulation.{key}.{name}: no such name; known: {known}.{hint}")
+            refuse_unknown(f"simulation.{key}.{name}", "no such name", name, names)
