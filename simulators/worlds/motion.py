@@ -18,15 +18,19 @@ SUBSTEPS = 10  # Runge-Kutta steps per row between rows, at least
 
 
 class Course(NamedTuple):
-    """How the inputs go while no other row's arrive: (n, du) each, from `since`, s, on."""
+    """How inputs go, each in one piece: (n, m, du) values at the times `since`, s, and slopes from there on."""
 
     value: np.ndarray
     slope: np.ndarray
     since: np.ndarray
 
+    def piece(self, j: int) -> "Course":
+        """Return one of the m, (n, du)."""
+        return Course(*(each[:, j] for each in self))
+
     def at(self, t: np.ndarray) -> np.ndarray:
-        """Return the inputs (n, du) at the times t (n,), s."""
-        return self.value + self.slope * (t[:, None] - self.since)
+        """Return the inputs (n, ..., du) at the times t (n, ...), s."""
+        return self.value + self.slope * (t[..., None] - self.since)
 
 
 class Inputs(NamedTuple):
@@ -46,23 +50,23 @@ class Inputs(NamedTuple):
     linear: np.ndarray
 
     def course(self, t: np.ndarray, late: np.ndarray) -> Course:
-        """Return how the inputs that arrive at the times t (n,), s, go, each `late` (n, du), s."""
-        row = np.zeros(late.shape, int)
-        for i in range(late.shape[1]):
-            row[:, i] = np.sum(self.times <= (t - late[:, i])[:, None], axis=1) - 1
-        episode, signal, known = np.arange(len(t))[:, None], np.arange(late.shape[1]), np.maximum(row, 0)
-        following = np.minimum(row + 1, self.times.shape[1] - 1)
-        rise = self.values[episode, following, signal] - self.values[episode, known, signal]
-        lasts = self.times[episode, following] - self.times[episode, known]
-        goes = self.linear & (row >= 0) & (lasts > 0)
-        slope = np.where(goes, rise, 0.0) / np.where(goes, lasts, 1.0)
-        return Course(self.values[episode, known, signal], slope, self.times[episode, known] + late)
+        """Return how the inputs go that act at the times t (n, m), s, each `late` (n, du), s, after its row."""
+        n, m = t.shape
+        row = np.zeros((n, m, late.shape[1]), int)
+        for k in range(n):
+            for i in range(late.shape[1]):
+                row[k, :, i] = np.searchsorted(self.times[k], t[k] - late[k, i], side="right") - 1
+        episode, signal = np.arange(n)[:, None, None], np.arange(late.shape[1])
+        known, following = np.maximum(row, 0), np.minimum(row + 1, self.times.shape[1] - 1)
+        value, begin = self.values[episode, known, signal], self.times[episode, known]
+        lasts = self.times[episode, following] - begin
+        goes = self.linear & (row >= 0) & (lasts > 0)  # before the first row and after the last all are held
+        slope = np.where(goes, self.values[episode, following, signal] - value, 0.0) / np.where(goes, lasts, 1.0)
+        return Course(value, slope, begin + late[:, None])
 
     def at(self, t: np.ndarray, tie: float) -> np.ndarray:
         """Return the inputs (n, m, du) as they are given at the times t (n, m), s; a row counts from `tie` s before it."""
-        none = np.zeros((len(t), self.values.shape[2]))
-        found = [self.course(t[:, m] + tie, none).at(t[:, m]) for m in range(t.shape[1])]
-        return np.stack(found, axis=1)
+        return self.course(t + tie, np.zeros((len(t), self.values.shape[2]))).at(t)
 
 
 class Drifting(NamedTuple):
@@ -169,6 +173,8 @@ def of_rows(
         k, m = np.nonzero(keys == key)
         finer = _shorter(source, float(after[k[0], m[0]]), cause)
         found[k, m] = finer.step(states[k, row[k, m]], inputs[k, row[k, m]], params[k])
+        for each in np.unique(m):
+            check_finite(source, found[:, each], float(times[:, each].max()))
     return found
 
 
@@ -200,8 +206,11 @@ def of_model(model: Model, start: np.ndarray, inputs: Inputs, params: Drifting, 
         ModelError: a state is not finite, or an input has a lag.
 
     """
+    RK4(model)  # refuses what has no finite past
     flow, late = _Flow.of(model, len(start)), _delays(model, params.begin)
     edges = _edges(inputs, late, times)
+    # the middle says which row's inputs act, free of the rounding at the ends
+    courses = inputs.course((edges[:, :-1] + edges[:, 1:]) / 2, late)
     z = flow.enter(start, params.at(edges[:, 0]))
     path = np.empty((*edges.shape, z.shape[1]))
     path[:, 0] = z
@@ -209,10 +218,9 @@ def of_model(model: Model, start: np.ndarray, inputs: Inputs, params: Drifting, 
     for j in range(edges.shape[1] - 1):
         begin, length = edges[:, j], edges[:, j + 1] - edges[:, j]
         if length.any():
-            course = inputs.course(begin + length / 2, late)
             steps = max(1, math.ceil(length.max() / longest - TIE))
             for s in range(steps):
-                z = flow.step(z, course, params, begin + s * length / steps, length / steps)
+                z = flow.step(z, courses.piece(j), params, begin + s * length / steps, length / steps)
             if not np.isfinite(z).all():
                 check_finite(model, flow.leave(z, params.at(edges[:, j + 1])), edges[:, j + 1].max())
         path[:, j + 1] = z

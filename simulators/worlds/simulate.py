@@ -267,10 +267,10 @@ class Simulate:
 
     def _finer(self) -> str:
         """Return the keys because of which the motion between rows matters."""
-        linear = any(word == "linear" for word in self.between_rows.values())
-        given = {"latency": self.latency, "clocks": self.clocks, "jitter": self.jitter}
-        given |= {"between_rows": linear, "drift": self.drift}
-        return " and ".join(f"simulation.{key}" for key, value in given.items() if value)
+        given = {key: [*getattr(self, key).values()] for key in ("latency", "drift")}
+        given |= {"clocks": [*self.clocks], "jitter": [self.jitter]}
+        given["between_rows"] = [word == "linear" for word in self.between_rows.values()]
+        return " and ".join(f"simulation.{key}" for key, values in given.items() if any(values))
 
     def _transitions(self, source: Model | World, dealt: Dealt) -> dict[str, np.ndarray]:
         """Independent rows: a state, an input and the state dt later."""

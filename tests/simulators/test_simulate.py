@@ -466,3 +466,12 @@ def test_a_seed_gives_the_numbers_that_it_always_gave(case: str) -> None:
     for name, values in how.run(source).columns.items():
         found.update(name.encode() + np.ascontiguousarray(values).tobytes())
     assert found.hexdigest()[:16] == expected
+
+
+@pytest.mark.parametrize(
+    "off", [{"latency": {"c": 0}}, {"drift": {"k": 0.0}}, {"between_rows": {"u": "held"}}, {"jitter": 0.0}]
+)
+def test_what_is_planted_as_nothing_changes_nothing(off: dict[str, Any]) -> None:
+    bare, same = (Simulate(episodes=2, steps=9, **how).run(decay()).columns for how in ({}, off))
+    for name, values in bare.items():
+        np.testing.assert_array_equal(same[name], values)

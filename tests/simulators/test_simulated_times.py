@@ -234,6 +234,21 @@ def test_a_world_is_late_by_whole_time_steps() -> None:
         Simulate(**how, steps=5, latency={"phi": 0.3 * step}).run(world)
 
 
+def test_a_world_has_sensors_with_clocks_of_whole_time_steps() -> None:
+    world = world_of("pendulum_world.yaml")
+    made = Simulate(episodes=1, steps=6, test_fraction=0, clocks={"phi": Clock(world.spec.option.timestep)}).run(world)
+    rows = rows_of(made)
+    assert np.isfinite(rows["phi"]).sum() == 5
+    np.testing.assert_array_equal(np.isnan(rows["phi"]), np.isfinite(rows["omega"]))
+    first, second = rows["phi"][1], rows["omega"][0]
+    initial = Simulate(episodes=1, steps=6, test_fraction=0).run(world).columns["phi"][0]
+    assert abs(np.angle(np.exp(1j * (first - initial - second * rows["t"][1])))) < 1e-3
+
+
+def lagged() -> Model:
+    return decay(inputs={"u": {"unit": "V", "range": [-1, 3], "lag": 0.2}}, outputs={})
+
+
 def _truth(world: Any, how: dict[str, Any]) -> np.ndarray:
     truth = Simulate(**how, steps=1).run(world).card["truth"]
     return np.array([truth[q.name] for q in world.params])
@@ -284,6 +299,11 @@ def test_a_function_as_a_world_is_late_by_whole_rows() -> None:
         (
             lambda: decay(dynamics={"c": "c**3"}), {"jitter": 0.1},
             r"simulation: c of decay is \S+ at t = \d.* s of episode 0; narrow simulation\.initial",
+        ),
+        (lambda: lagged(), {"jitter": 0.1}, r"sim\.inputs\.u\.lag: .* cannot lag inputs"),
+        (
+            lambda: world_of("pendulum_world.yaml"), {"clocks": {"phi": Clock(1e-5)}},
+            r"simulation\.clocks: pendulum_world is asked .* no whole number",
         ),
         (lambda: world_of("pendulum_world.yaml"), {"jitter": 0.1}, r"simulation\.jitter: pendulum_world is a world"),
         (lambda: world_of("pendulum_world.yaml"), {"drift": {"m": 0.1}}, r"simulation\.drift: pendulum_world is a world"),
