@@ -4,7 +4,7 @@ A query compiles the XML with its own parameter values, so that everything that 
 poses) follows, sets the joints, gives each actuator its command and lets MuJoCo run for dt.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import mujoco
@@ -59,6 +59,7 @@ class CompiledWorld:
         controls: which actuator each input drives.
         delays: by how many of MuJoCo's time steps each input arrives late.
         threads: threads that share the queries.
+        part: time steps of a transition after which a query is answered; None: all.
 
     """
 
@@ -75,6 +76,23 @@ class CompiledWorld:
     controls: tuple[int, ...]
     delays: tuple[int, ...]
     threads: int = 1
+    part: int | None = None
+
+    def shorter(self, duration: float) -> "CompiledWorld":
+        """Return the world that answers after `duration` s of a transition; see `FinerWorld.shorter`.
+
+        Raises:
+            ModelError: no whole number of MuJoCo's time steps.
+
+        """
+        timestep = self.spec.option.timestep
+        part = round(duration / timestep)
+        if part < 1 or abs(duration - part * timestep) > 1e-9:
+            raise ModelError(
+                f"{self.name} is asked {duration:g} s after a row, which is no whole number of MuJoCo's time steps of "
+                f"{timestep:g} s; change it, or set sim.timestep"
+            )
+        return replace(self, part=part)
 
     def step(self, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> np.ndarray:
         """Answer n queries: states (n, ds), inputs (n, du), params (n, dp) -> states dt later (n, ds), not wrapped.
@@ -103,16 +121,19 @@ class CompiledWorld:
         begin[:, self.state_columns] = states[:, : len(self.state_columns)]
         control = np.zeros((len(states), n_steps, models[0].nu))
         control[:, :, self.controls], waiting = self._late(states[:, len(self.state_columns) :], inputs, n_steps)
+        n_run = n_steps if self.part is None else self.part
+        if n_run < n_steps:  # those on their way until the next transition begins
+            waiting = states[:, len(self.state_columns) :]
         path, _ = mujoco.rollout.rollout(
             [models[i] for i in which],
             [mujoco.MjData(models[0]) for _ in range(self.threads)],
             begin,
-            control if models[0].nu else None,
-            nstep=n_steps,
+            np.ascontiguousarray(control[:, :n_run]) if models[0].nu else None,
+            nstep=n_run,
         )
         end = path[:, -1]
         # after a warning MuJoCo resets the state and rollout stops: the clock tells
-        complete = np.abs(end[:, :1] - self.dt) < timestep / 2
+        complete = np.abs(end[:, :1] - n_run * timestep) < timestep / 2
         return np.where(complete, np.column_stack([end[:, self.state_columns], waiting]), np.nan)
 
     def _late(self, past: np.ndarray, inputs: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray]:

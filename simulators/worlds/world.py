@@ -55,3 +55,18 @@ class World(Protocol):
             The states dt later, (n, ds), not wrapped; a row of NaN where the world could not go on.
 
         """
+
+
+@runtime_checkable
+class FinerWorld(World, Protocol):
+    """A world that also answers for a part of a transition."""
+
+    def shorter(self, duration: float) -> World:
+        """Return the world whose `step` goes on for `duration` s only, at most `dt`.
+
+        The states, commands on their way among them, mean what they mean in the middle of a transition.
+
+        Raises:
+            ModelError: its time steps do not reach that instant.
+
+        """

@@ -313,6 +313,29 @@ class TestSimulate:
         )
         assert {row["n_train"] for row in rows(tmp_path / "f")} == {57}
 
+    def test_planted_nuisances_of_a_yaml_and_of_the_command_line(self, tmp_path: Path) -> None:
+        (tmp_path / "my" / "simulation").mkdir(parents=True)
+        (tmp_path / "my" / "simulation" / "rig.yaml").write_text(
+            "# a rig\nepisodes: 4\nsteps: 20\nnoise_std: {phi: 0.01 + 0.02*abs(omega)}\n"
+            "noise: {phi: {law: student_t, degrees_of_freedom: 3}}\nsaturates: {omega: [null, 1]}\nlatency: {phi: 0.012}\n"
+            "clocks: {omega: {offset: 0.003, drift: 1.0e-5}}\nbetween_rows: {u: linear}\nquantisation: {omega: 0.1}\n"
+            "groups: {rig: {count: 2, parameters: {l: {law: lognormal, std: 0.2}}}}\n"
+            "covariates: {mass_kg: {parameter: m, range: [0.5, 1.5], per: rig}}\n"
+        )
+        words = ("--config-dir", "my", "sim=pendulum", "simulation=rig", "out=made")
+        run(tmp_path, "simulate", *words, "simulation.missing.phi=0.2", "simulation.drift={C_m: 0.1}")
+        table = pq.read_table(tmp_path / "made" / "measurements.parquet").to_pydict()
+        assert [*table] == ["episode", "t", "rig", "mass_kg", "phi", "omega", "u", "split"]
+        assert len(table["t"]) == 4 * (20 + 19)
+        assert np.isnan(table["phi"]).sum() > 4 * 19
+        card = yaml.safe_load((tmp_path / "made" / "card.yaml").read_text())
+        assert card["noise"] == {"phi": {"law": "student_t", "degrees_of_freedom": 3.0}}
+        assert card["noise_std"] == {"phi": "0.01 + 0.02*abs(omega)", "omega": 0.0}
+        assert card["saturates"] == {"omega": [None, 1.0]}
+        assert (card["missing"], card["drift"], card["latency"]) == ({"phi": 0.2}, {"C_m": 0.1}, {"phi": 0.012})
+        assert card["truth_by_group"]["rig"].keys() == {"rig_0", "rig_1"}
+        assert card["columns"]["mass_kg"] == {"unit": "kg"}
+
     def test_a_static_function(self, tmp_path: Path) -> None:
         words = ("simulation.episodes=4", "simulation.steps=10", "simulation.noise_std.f=0.1", "out=my/made")
         run(tmp_path, "simulate", "sim=sinusoid", *words)
