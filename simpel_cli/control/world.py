@@ -129,11 +129,12 @@ def learned_world(
     encoding: Encoding,
     goal: Goal,
     members: Callable[[Float[Array, "L n dx"]], Float[Array, "L n dy"]],
-    noise_std: Float[Array, " dy"],
+    noise_scale: Float[Array, " dy"],
     particles: int,
     sampling: str = "ts1",
     *,
     aleatoric: bool = True,
+    tail: Float[Array, " dy"] | None = None,
 ) -> World:
     """Return the world of a posterior.
 
@@ -141,10 +142,11 @@ def learned_world(
         encoding: coordinates.
         goal: the task.
         members: targets of every particle at its own inputs.
-        noise_std: of the observations, data units.
+        noise_scale: of the observations, data units.
         particles: L.
         sampling: `ts1` a particle drawn anew at every step, `tsinf` one for a whole roll-out, `mean` the mean of all.
         aleatoric: whether noise is added (never to the mean).
+        tail: 1/nu of noise that is Student's t; None: it is Gaussian.
 
     Reference: Chua et al. (2018), Deep reinforcement learning in a handful of trials, section 5 (trajectory sampling).
     """
@@ -161,7 +163,13 @@ def learned_world(
         rolled = jnp.roll(x, turn, axis=0)
         y = members(rolled.reshape(particles, n // particles, -1)).reshape(n, -1)
         y = jnp.roll(y, -turn, axis=0)
-        return y + noise_std[None].astype(y.dtype) * jax.random.normal(key_noise, y.shape, y.dtype) if aleatoric else y
+        if not aleatoric:
+            return y
+        if tail is None:
+            error = jax.random.normal(key_noise, y.shape, y.dtype)
+        else:
+            error = jax.random.t(key_noise, jnp.broadcast_to(1 / tail[None], y.shape).astype(y.dtype), y.shape, y.dtype)
+        return y + noise_scale[None].astype(y.dtype) * error
 
     return world_of(encoding, goal, follow, multiple=1 if sampling == "mean" else particles)
 

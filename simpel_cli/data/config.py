@@ -9,6 +9,7 @@ from simulators.quantity import BETWEEN_ROWS
 
 LAYOUTS = ("trajectories", "transitions")
 CHOICES = ("random", "first")
+LAWS = ("auto", "gaussian", "student_t")
 SPLIT_BY = ("episode", "time")
 SPLIT_DEFAULT: dict[str, Any] = {"test_fraction": 0.25, "by": "episode"}
 
@@ -34,6 +35,8 @@ class Measurements:
             episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
             at the simulator's dt and is estimated where absent.
+        noise: `{law: gaussian}`, or `student_t` with degrees of freedom that are learned per output, for measurements of which
+            some lie far off; `auto`: what the training rows say, by their leave-one-out log score.
         resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.
         layout: `trajectories` (rows follow each other) or `transitions` (next values in `next_<state column>`).
         n_train: number of training transitions to use; null = all, 0 = none: the posterior is the prior.
@@ -61,6 +64,7 @@ class Measurements:
     computed: Mapping[str, str] = field(default_factory=dict)
     split: Mapping[str, Any] = field(default_factory=lambda: dict(SPLIT_DEFAULT))
     noise_std: Mapping[str, float | int] = field(default_factory=dict)
+    noise: Mapping[str, Any] = field(default_factory=dict)
     resample: float | int | None = None
     layout: str = "trajectories"
     n_train: int | None = None
@@ -86,6 +90,10 @@ class Measurements:
         _whole("stack_actions", self.stack_actions, 0)
         for name, std in self.noise_std.items():
             _positive(f"noise_std.{name}", std)
+        for key in self.noise:
+            if key != "law":
+                raise ConfigError(f"data.noise.{key}: no such key, only law.{did_you_mean(key, ['law'])}")
+        _one_of("noise.law", self.law, LAWS)
         for name, word in self.between_rows.items():
             _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
         _check_split(self.split)
@@ -112,6 +120,11 @@ class Measurements:
     def paths(self) -> tuple[str, ...]:
         """The files, one or several."""
         return (self.path,) if isinstance(self.path, str) else tuple(self.path)
+
+    @property
+    def law(self) -> str:
+        """Law of the noise: auto, gaussian or student_t."""
+        return str(self.noise.get("law", "auto"))
 
     def seed_or(self, run_seed: int) -> int:
         """Return the seed of the split and of the choice: its own if declared, else the run's."""

@@ -50,7 +50,13 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
 
 @jax.jit
 def _measure(p: Predictive, y: jax.Array) -> tuple[jax.Array, ...]:
-    r = ((y - p.mean) / p.std) ** 2
+    inner = jnp.abs(2 * p.cdf(y) - 1)  # share of the mass that lies nearer to the median
+    # heavy tails have no chi-squared law: theirs is what a Gaussian of the same share would have
+    r = (
+        ((y - p.mean) / p.std) ** 2
+        if p.tail is None
+        else jax.scipy.special.ndtri((1 + jnp.minimum(inner, 1 - 1e-12)) / 2) ** 2
+    )
     columns = (
         -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), p.cdf(y), r, p.mahalanobis(y), p.mean, p.std, p.epistemic_std,
     )  # fmt: skip
@@ -61,7 +67,7 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
     n, dy = y.shape
     pad = [(0, CHUNK - n), (0, 0)]
     p = posterior.predict(np.pad(x, pad, mode="edge"))
-    p = Predictive(*(a.astype(jnp.float64) for a in p))
+    p = jax.tree.map(lambda a: a.astype(jnp.float64), p)
     columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
     nll, joint, crps, pit, r, distance, mean, std, epistemic = columns
     error = y - mean

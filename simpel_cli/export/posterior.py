@@ -43,7 +43,9 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
         name: leaves[f"['problem']['normaliser'].{name}"][index] for name in ("x_mean", "x_std", "y_mean", "y_std")
     }
     rho, floor = (jnp.asarray(leaves[name][index]) for name in (f"{root}.noise", "['problem']['noise_floor']"))
-    arrays = scale | {"noise_std": np.asarray(method.noise.std(rho, floor)) * scale["y_std"]}
+    law = leaves.get("['problem']['tail']")
+    noise = np.asarray(method.noise.std(rho, floor)) * scale["y_std"]
+    arrays = scale | {"noise_std": noise if law is None else noise / np.sqrt(1 - 2 * law[index])}
     count = sum(name.startswith(f"{root}.particles[") for name in leaves) // 2
     for i in range(count):
         arrays[f"kernel_{i}"] = leaves[f"{root}.particles[{i}][0]"][index]
@@ -64,6 +66,8 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
             {"name": name, "unit": unit, "kind": kind}
             for name, unit, kind in zip(encoding.y_names, encoding.y_units, encoding.y_kinds, strict=True)
         ],
+        "noise": "noise_std is a standard deviation; of Student's t the scale is noise_std*sqrt(1 - 2/degrees_of_freedom)",
+        "degrees_of_freedom": None if law is None else [float(1 / tail) for tail in law[index]],
         "networks": len(arrays["bias_0"]),
         "seed": declared.settings.all_seeds[index],
         "step": kept.get("step"),

@@ -6,19 +6,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.protocols import Bank, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.inference.scales import Chooser, chosen
 from simpel_cli.inference.system import System
-from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
-from simpel_cli.priors.gap_scale import marginal_likelihood_scales
-from simpel_cli.priors.marginal_likelihood import TYPICAL_SCALE, noise_of_smooth
-
-SCALE_POINTS, SCALE_DRAWS = 512, 512
-WORLD_SCALE_POINTS = 128
+from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 
 
 class Assembled(NamedTuple):
@@ -27,6 +23,7 @@ class Assembled(NamedTuple):
     setting: Setting
     problems: Problem  # leaves (seeds, ...)
     gap_scale: np.ndarray | None  # kappa per target in data units, of the first seed; None: no gap
+    heavy_tails: float  # nats of leave-one-out log score by which Student's t noise is ahead; NaN: not looked at
 
 
 def assemble(
@@ -42,6 +39,7 @@ def assemble(
     pool: int,
     keys: list[PRNGKeyArray],
     precision: str,
+    law: str = "auto",
 ) -> Assembled:
     """Build the problem arrays of every seed.
 
@@ -57,6 +55,7 @@ def assemble(
         pool: number of domain points of a bank (for worlds).
         keys: one per seed, for draws of the prior that are made here.
         precision: dtype name of the networks.
+        law: of the noise: gaussian, student_t, or auto: what the training data say (`priors.noise_law`).
     """
     dtype = jnp.dtype(precision)
     encoding = system.encoding
@@ -65,38 +64,38 @@ def assemble(
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
     declared = encoding.per_target(declared_noise, 0.0) / normaliser.y_std
     noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma, declared))
-    problems, scales = [], []
-    for (x, y), key in zip(training, keys, strict=True):
+    targets = [(y - normaliser.y_mean) / normaliser.y_std for _, y in training]
+    split = [jax.random.split(key) for key in keys]
+    chooser = Chooser(prior, bound, system, normaliser, noise, noise_init)
+    rows = [(x, y) for (x, _), y in zip(training, targets, strict=True)]
+    choices, gain = chosen(chooser, rows, [key for key, _ in split], law)
+    problems = []
+    for (x, y), (_, key), own in zip(rows, split, choices, strict=True):
         m, length = len(x), padded_length(max(len(x), 1))
         if m == 0:  # what pads must be simulable
-            x, y = np.asarray(normaliser.x_mean)[None], np.asarray(normaliser.y_mean)[None]
-        targets = (y - normaliser.y_mean) / normaliser.y_std
-        key_scale, key_bank = jax.random.split(key)
-        scale, sigma = _scales(
-            prior, bound, system, normaliser, x[:m], targets[:m], noise_init, key_scale,
-            # of more rows than are looked at networks learn the noise better than those tell it
-            with_noise=noise.learn and noise.marginal_share > 0 and m <= _most_rows(prior, system),
-        )  # fmt: skip
+            x, y = np.asarray(normaliser.x_mean)[None], np.zeros((1, encoding.dim_y))
+        floors = own.noise if m <= chooser.most_rows else np.zeros_like(own.noise)
         arrays = Problem(
             x=pad_rows(x, length),
-            y=pad_rows(targets, length),
+            y=pad_rows(y, length),
             m=np.array(m, np.int32),
             normaliser=normaliser,
-            gap_scale=scale,
-            noise_init=noise_init,
-            noise_floor=np.asarray(noise.raised(noise_floor, noise.marginal_share * sigma, noise_init)),
-            bank=_bank(prior, system, pad_rows(x, length), pool, key_bank),
+            gap_scale=own.gap,
+            noise_init=noise_init if own.law is None else np.maximum(own.law.scale, noise.floor),
+            noise_floor=np.asarray(noise.raised(noise_floor, noise.marginal_share * floors, noise_init)),
+            bank=_bank(prior, system, pad_rows(x, length), pool, key),
+            tail=None if own.law is None else own.law.tail,
+            weights=None if own.law is None else pad_rows(own.law.weights, length),
         )
         problems.append(arrays)
-        scales.append(scale)
 
     def stack(*leaves: np.ndarray) -> jax.Array:
         stacked = np.stack(leaves)
         return jnp.asarray(stacked, dtype if np.issubdtype(stacked.dtype, np.floating) else None)
 
     setting = Setting(bound, score, lambda key, n: system.domain.sample(key, n, dtype))  # type: ignore[arg-type]
-    gap_scale = scales[0] * normaliser.y_std if prior.gap is not None else None
-    return Assembled(setting, jax.tree.map(stack, *problems), gap_scale)
+    gap_scale = choices[0].gap * normaliser.y_std if prior.gap is not None else None
+    return Assembled(setting, jax.tree.map(stack, *problems), gap_scale, gain)
 
 
 def _refuse_lost_digits(encoding: Encoding, y_std: np.ndarray, dtype: jnp.dtype) -> None:
@@ -119,69 +118,3 @@ def _bank(prior: SimulatorPrior | GPPrior, system: System, x: np.ndarray, pool: 
     key_x, key_phi = jax.random.split(key)
     points = np.concatenate([x, np.asarray(system.domain.sample(key_x, pool, jnp.float64))])
     return Bank(points, np.moveaxis(system.simulate(key_phi, points, prior.draws), 0, -1))
-
-
-def _most_rows(prior: SimulatorPrior | GPPrior, system: System) -> int:
-    """Rows that the marginal likelihood looks at."""
-    queries = prior.uses_simulator and system.transition is None
-    return WORLD_SCALE_POINTS if queries else SCALE_POINTS
-
-
-def _scales(
-    prior: SimulatorPrior | GPPrior,
-    bound: FunctionPrior,
-    system: System,
-    normaliser: Normaliser,
-    x: np.ndarray,
-    targets: np.ndarray,
-    noise_init: np.ndarray,
-    key: PRNGKeyArray,
-    *,
-    with_noise: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return kappa and sigma per target in normalised units, sigma 0 where it is not asked for.
-
-    kappa is what the prior declares; what it does not is chosen by marginal likelihood, as sigma is.
-    """
-    gap: GapGP | None = prior.gap
-    size = system.encoding.dim_y
-    given = np.zeros(size)
-    if gap is not None:
-        given = given + (np.nan if isinstance(gap.scale, str) else gap.scale)
-        if gap.scale == "declared":
-            given = system.encoding.per_target(system.source.gap, np.nan) / normaliser.y_std
-    if len(x) == 0:  # nothing to choose by
-        return np.where(np.isnan(given), TYPICAL_SCALE, given), np.zeros(size)
-    if not (np.isnan(given).any() or with_noise):
-        return given, np.zeros(size)
-    subset: slice | np.ndarray = slice(None)
-    if len(x) > _most_rows(prior, system):  # the first ones may all be of one episode
-        key, key_rows = jax.random.split(key)
-        subset = np.asarray(jax.random.choice(key_rows, len(x), (_most_rows(prior, system),), replace=False))
-    here = x[subset]
-    samples = np.zeros((2, len(here), size))
-    if prior.uses_simulator:
-        samples = (system.simulate(key, here, SCALE_DRAWS) - normaliser.y_mean) / normaliser.y_std
-    normalised = (here - normaliser.x_mean) / normaliser.x_std
-
-    def stretched(longer: float) -> Array:
-        """Correlation per output of a lengthscale so many times the declared one."""
-        other = bound._replace(white_variance=0.0, input_scale=np.asarray(bound.input_scale) / longer)
-        return other.covariance(jnp.asarray(normalised), jnp.ones(size))
-
-    correlation = np.asarray(stretched(1.0)[0])
-    chosen = [
-        marginal_likelihood_scales(
-            samples[:, :, i], correlation, targets[subset, i], noise_init[i], prior.white_variance,
-            None if np.isnan(given[i]) else float(given[i]),
-        )
-        for i in range(size)
-    ]  # fmt: skip
-    scale, sigma = (np.array(values) for values in zip(*chosen, strict=True))
-    if with_noise and not prior.uses_simulator:
-        smooth = np.asarray(noise_of_smooth(
-            lambda longer: stretched(longer)[0], targets[subset], np.array(len(here), np.int32), prior.white_variance, 1.0,
-            np.full(size, 1e-3), noise_init,
-        ))  # fmt: skip
-        sigma = np.maximum(sigma, smooth)
-    return scale, sigma if with_noise else np.zeros(size)

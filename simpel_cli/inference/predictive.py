@@ -1,6 +1,6 @@
-"""The predictive distribution: an equal-weight mixture of one Gaussian per particle.
+"""The predictive distribution: an equal-weight mixture of one law of noise per particle.
 
-p(y | x) = 1/L sum_l prod_i N(y_i; h_li(x), sigma_i^2)
+p(y | x) = 1/L sum_l prod_i p_i((y_i - h_li(x)) / sigma_i) / sigma_i,    p_i Gaussian or Student's t (`student_t`)
 """
 
 from typing import NamedTuple
@@ -9,17 +9,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from simpel_cli.inference import student_t
+
 
 class Predictive(NamedTuple):
     """Predictions of L particles at n inputs, in data units.
 
     Args:
         particles: function values.
-        noise_std: standard deviation of the observation noise, shared by the particles.
+        noise_scale: scale of the observation noise, shared by the particles: of a Gaussian its standard deviation.
+        tail: 1/nu of Student's t, positive; None: the noise is Gaussian.
     """
 
     particles: Float[Array, "L n dy"]
-    noise_std: Float[Array, " dy"]
+    noise_scale: Float[Array, " dy"]
+    tail: Float[Array, " dy"] | None = None
+
+    @property
+    def noise_std(self) -> Float[Array, " dy"]:
+        """Standard deviation of the observation noise."""
+        return self.noise_scale if self.tail is None else student_t.standard_deviation(self.noise_scale, self.tail)
 
     @property
     def mean(self) -> Float[Array, "n dy"]:
@@ -45,25 +54,43 @@ class Predictive(NamedTuple):
         return _mixture(self._log_densities(y))
 
     def _log_densities(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
-        z = (y[None] - self.particles) / self.noise_std[None, None]
-        return -0.5 * z * z - jnp.log(self.noise_std)[None, None] - 0.5 * jnp.log(2 * jnp.pi).astype(z.dtype)
+        z = self._standardised(y)
+        if self.tail is None:
+            return -0.5 * z * z - jnp.log(self.noise_scale)[None, None] - 0.5 * jnp.log(2 * jnp.pi).astype(z.dtype)
+        return student_t.log_density(z, self.tail[None, None]) - jnp.log(self.noise_scale)[None, None]
+
+    def _standardised(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
+        return (y[None] - self.particles) / self.noise_scale[None, None]
 
     def cdf(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Cumulative distribution of each output's mixture at y (the probability integral transform)."""
-        z = (y[None] - self.particles) / self.noise_std[None, None]
-        return jnp.mean(jax.scipy.stats.norm.cdf(z), axis=0)
+        z = self._standardised(y)
+        below = jax.scipy.stats.norm.cdf(z) if self.tail is None else student_t.cdf(z, self.tail[None, None])
+        return jnp.mean(below, axis=0)
 
     def crps(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Continuous ranked probability score of each output, in its unit; lower is better.
 
-        Reference: Grimit, Gneiting, Berrocal and Johnson (2006), the closed form for Gaussian mixtures.
+        Reference: Grimit, Gneiting, Berrocal and Johnson (2006), the closed form for Gaussian mixtures; for those of
+        Student's t the same difference of expectations.
         """
-        sigma = self.noise_std[None]
+        sigma = self.noise_scale[None]
+        if self.tail is None:
 
-        def spread(member: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-            return jnp.mean(_expected_abs(member[None] - self.particles, 2**0.5 * sigma[None]), axis=0)
+            def spread(member: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+                return jnp.mean(_expected_abs(member[None] - self.particles, 2**0.5 * sigma[None]), axis=0)
 
-        to_data = jnp.mean(_expected_abs(y[None] - self.particles, sigma[None]), axis=0)
+            to_data = jnp.mean(_expected_abs(y[None] - self.particles, sigma[None]), axis=0)
+        else:
+            grid, table = student_t.distance_table(self.tail)
+
+            def spread(member: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+                apart = jnp.abs(member[None] - self.particles) / sigma[None]
+                near = jax.vmap(lambda a, t: jnp.interp(a, grid, t), in_axes=(2, 0), out_axes=2)(apart, table)
+                return jnp.mean(jnp.where(apart < grid[-1], near, apart), axis=0) * sigma
+
+            distance = student_t.expected_distance(self._standardised(y), self.tail[None, None])
+            to_data = jnp.mean(distance, axis=0) * sigma
         between = jnp.mean(jax.lax.map(spread, self.particles), axis=0)
         return to_data - 0.5 * between
 

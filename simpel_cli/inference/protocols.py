@@ -45,7 +45,8 @@ class Problem(NamedTuple):
     """Everything a compiled program reads, as one argument of fixed shape (so that runs share programs).
 
     Training arrays are padded to a common length; only the first `m` rows count. Inputs `x` are in data units,
-    targets `y`, `gap_scale`, `noise_init` and `noise_floor` in normalised output units.
+    targets `y`, `gap_scale`, `noise_init` and `noise_floor` in normalised output units. Where the noise is Student's t, `tail`
+    is 1/nu and `weights` the expected weight of every row, for rules in closed form; None: it is Gaussian.
     """
 
     x: Float[Numbers, "m_padded dx"]
@@ -56,6 +57,13 @@ class Problem(NamedTuple):
     noise_init: Float[Numbers, " dy"]
     noise_floor: Float[Numbers, " dy"]
     bank: Bank | None = None
+    tail: Float[Numbers, " dy"] | None = None
+    weights: Float[Numbers, "m_padded dy"] | None = None
+
+    @property
+    def tails(self) -> Float[Array, " dy"] | None:
+        """1/nu of Student's t noise as an array of the program; None: the noise is Gaussian."""
+        return None if self.tail is None else jnp.asarray(self.tail)
 
 
 @runtime_checkable

@@ -22,7 +22,7 @@ from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.priors.gaussian_process import gram
-from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, spectrum
+from simpel_cli.priors.marginal_likelihood import Spectrum, best_of_each, weighted_spectra
 
 
 class State(NamedTuple):
@@ -86,12 +86,12 @@ class ExactGP:
             phi = identified(self.sysid, setting, problem, key)
             known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
-            data = spectrum(gram(kernel, known, known), left, problem.m)
+            data = weighted_spectra(gram(kernel, known, known), left, problem.m, problem.weights)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = best_scales(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
+            best = best_of_each(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
-                data,
+                data if problem.weights is not None else jax.tree.map(lambda a: a[0], data),
                 best.noise.astype(dtype),
                 (jnp.sum(best.loss) / jnp.maximum(jnp.sum(counts), 1)).astype(dtype),
             )
@@ -101,17 +101,28 @@ class ExactGP:
 
         def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
             """Mean and standard deviation of the function, normalised."""
-            reach = (gram(kernel, scaled(x), scaled(problem.x)) * counts[None]) @ state.data.vectors
+            known, data = gram(kernel, scaled(x), scaled(problem.x)) * counts[None], state.data
+            if problem.weights is None:  # one basis serves all outputs
+                values, reach, turned, own = data.values, known @ data.vectors, data.turned.T, None
+            else:
+                roots = jnp.sqrt(jnp.asarray(problem.weights).astype(jnp.float64)).T
+                reach = jax.vmap(lambda root, vectors: (known * root[None]) @ vectors)(roots, data.vectors)
+                values, turned, own = data.values, data.turned[..., 0], 0
 
             def of_output(
-                kappa: Float[Array, ""], sigma: Float[Array, ""], turned: Float[Array, " m"]
+                kappa: Float[Array, ""],
+                sigma: Float[Array, ""],
+                values: Float[Array, " m"],
+                reach: Float[Array, "n m"],
+                turned: Float[Array, " m"],
             ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-                total = kappa**2 * state.data.values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
+                total = kappa**2 * values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
                 taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
                 std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + prior.white_variance)
                 return kappa**2 * (reach @ (turned / total)), std
 
-            mean, std = jax.vmap(of_output, in_axes=(0, 0, 1), out_axes=1)(kappa, state.noise_std, state.data.turned)
+            each = jax.vmap(of_output, in_axes=(0, 0, own, own, 0), out_axes=1)
+            mean, std = each(kappa, state.noise_std, values, reach, turned)
             return simulated(state.phi, x) + mean.astype(dtype), std.astype(dtype)
 
         def quantiles() -> Float[Array, "L dy"]:
@@ -124,7 +135,7 @@ class ExactGP:
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             mean, std = predicted(state, x)
             h = mean[None] + quantiles()[:, None] * std[None]
-            return Predictive(scale.y_to_data(h), state.noise_std * scale.y_std)
+            return Predictive(scale.y_to_data(h), state.noise_std * scale.y_std, problem.tails)
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
             def one(x: Float[Array, "n dx"], q: Float[Array, " dy"]) -> Float[Array, "n dy"]:

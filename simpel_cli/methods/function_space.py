@@ -23,8 +23,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError, check_at_least_one
+from simpel_cli.inference import student_t
 from simpel_cli.inference.networks import MLP
-from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.particle_networks import Networks, State, refuse_rates
 from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
@@ -184,18 +185,20 @@ class FunctionSpace(ABC):
 
             weight = problem.m.astype(dtype) / at_least_one(counted)
             fit, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: log_likelihood(h, networks.noise_std(rho), y, counted), argnums=(0, 1)
+                lambda h, rho: log_likelihood(h, networks.noise_scale(rho), y, counted, problem.tails), argnums=(0, 1)
             )(h[:, :b], state.noise)
             prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(scores, h)
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
             velocity, mean_kernel = self.velocity(h, score)
             if prior_basis is not None:
-                evenly = networks.noise_std(state.noise) ** 2 * h.shape[1] / jnp.maximum(problem.m, 1).astype(dtype)
+                evenly = networks.noise_scale(state.noise) ** 2 * h.shape[1] / jnp.maximum(problem.m, 1).astype(dtype)
+                if problem.tails is not None:
+                    evenly = evenly / student_t.information(problem.tails)[0]
                 velocity = preconditioned(velocity, prior_basis, evenly, self.prior_weight)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)
-            info = Info(-fit / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            info = Info(-fit / (at_least_one(counted) * self.particles), networks.noise_scale(state.noise), mean_kernel)
             return after, info
 
         return Inference(networks.init, draw, step, networks.predict, networks.members)
@@ -227,8 +230,21 @@ def distinct_rows(key: PRNGKeyArray, size: int, m: Int[Array, ""]) -> tuple[Int[
 
 
 def log_likelihood(
-    h: Float[Array, "L b dy"], sigma: Float[Array, " dy"], y: Float[Array, "b dy"], counted: Float[Array, " b"]
+    h: Float[Array, "L b dy"],
+    sigma: Float[Array, " dy"],
+    y: Float[Array, "b dy"],
+    counted: Float[Array, " b"],
+    tail: Float[Numbers, " dy"] | None = None,
 ) -> Float[Array, ""]:
-    """Return the sum over particles, counted points and outputs of log N(y; h, sigma^2), up to a constant."""
+    """Return the sum over particles, counted points and outputs of the log density of the noise, up to a constant.
+
+    Args:
+        h: function values.
+        sigma: scale of the noise.
+        y: measured targets.
+        counted: 1 for data, 0 for what fills the batch.
+        tail: of Student's t, which keeps a row that is far off from dragging a sharp posterior; None: Gaussian.
+    """
     z = (y[None] - h) / sigma[None, None]
-    return jnp.sum((-0.5 * z * z - jnp.log(sigma)[None, None]) * counted[None, :, None])
+    law = -0.5 * z * z if tail is None else student_t.log_density(z, jnp.asarray(tail)[None, None])
+    return jnp.sum((law - jnp.log(sigma)[None, None]) * counted[None, :, None])

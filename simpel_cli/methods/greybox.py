@@ -23,10 +23,10 @@ from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.priors.function_prior import GPPrior
 from simpel_cli.priors.marginal_likelihood import (
     MOST_ROWS,
-    best_scales,
+    best_of_each,
     evenly,
     noise_of_smooth,
-    spectrum,
+    weighted_spectra,
 )
 from simpel_cli.scores.gaussian import Gaussian
 
@@ -123,10 +123,13 @@ class GreyBox:
                 return stretched.covariance(x, ones[:1])[0]
 
             prior_std = noise.prior_std if noise.learn else None
-            best = best_scales(spectrum(correlation(1.0), y, m), kappa, 0.0, prior_std, floor, init)
+            weights = None if problem.weights is None else jnp.asarray(problem.weights)[rows]
+            best = best_of_each(weighted_spectra(correlation(1.0), y, m, weights), kappa, 0.0, prior_std, floor, init)
             if not floors:
                 return best.scale.astype(dtype), jnp.asarray(floor)
-            sigma = jnp.maximum(best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init))
+            sigma = jnp.maximum(
+                best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init, weights)
+            )
             least = noise.raised(floor, noise.marginal_share * sigma.astype(dtype), init)
             return best.scale.astype(dtype), jnp.asarray(least)
 

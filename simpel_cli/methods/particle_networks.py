@@ -61,7 +61,7 @@ class Networks(NamedTuple):
         noise = self.noise.init(problem.noise_init, problem.noise_floor)
         return State(particles, noise, self.optimiser.init((particles, noise)))
 
-    def noise_std(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+    def noise_scale(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
         """Return sigma, normalised."""
         return self.noise.std(rho, self.problem.noise_floor)
 
@@ -87,7 +87,7 @@ class Networks(NamedTuple):
         """Return the predictive at inputs in data units."""
         scale = self.problem.normaliser
         h = self.network.apply_all(state.particles, scale.x(x))
-        return Predictive(scale.y_to_data(h), self.noise_std(state.noise) * scale.y_std)
+        return Predictive(scale.y_to_data(h), self.noise_scale(state.noise) * scale.y_std, self.problem.tails)
 
     def members(self, state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
         """Return the targets of every network at its own inputs, data units."""

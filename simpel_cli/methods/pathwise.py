@@ -123,6 +123,9 @@ class Pathwise:
         rows, count = evenly(n_rows, jnp.asarray(problem.m), self.most_rows)
         counts = (jnp.arange(len(rows), dtype=jnp.int32) < count).astype(jnp.float64)
         known = scale.x(jnp.asarray(problem.x)[rows])
+        weights = jnp.ones((len(rows), dim_y), jnp.float64)
+        if problem.weights is not None:  # Student's t noise: a Gaussian whose variance differs from row to row
+            weights = jnp.asarray(problem.weights)[rows].astype(jnp.float64)
 
         def simulated(key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: Int[Array, " n"]) -> Float[Array, "n dy N"]:
             """Draws at inputs in data units, which are these rows of a bank, normalised; those of the paths first."""
@@ -164,25 +167,33 @@ class Pathwise:
         ) -> Float[Array, " dy"]:
             """Noise of the largest marginal likelihood, normalised."""
             few, _ = evenly(len(rows), count, MOST_ROWS)
-            real, left = counts[few], (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
+            left = (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
             correlation = correlations(known[few], known[few])
 
             def of_output(
                 given: tuple[
-                    Float[Array, "c N"], Float[Array, " c"], Float[Array, ""], Float[Array, ""], Float[Array, ""]
+                    Float[Array, "c N"],
+                    Float[Array, " c"],
+                    Float[Array, ""],
+                    Float[Array, ""],
+                    Float[Array, ""],
+                    Float[Array, " c"],
                 ],
             ) -> Float[Array, ""]:
-                own, left, kappa, floor, typical = given
+                own, left, kappa, floor, typical, root = given
+                real, left = root * counts[few], root * left  # rows count by their weights
                 law = (own @ own.T + kappa**2 * correlation) * real[:, None] * real[None]
                 values, vectors = jnp.linalg.eigh(law)
-                turned = vectors.T @ (left * real)[:, None]
-                spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(real))
+                turned = vectors.T @ (left * counts[few])[:, None]
+                spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(counts[few]))
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
                 return best_scales(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
-            found: Array = jax.lax.map(of_output, (draws[:, few], left.T, kappa, floor, typical))
+            found: Array = jax.lax.map(
+                of_output, (draws[:, few], left.T, kappa, floor, typical, jnp.sqrt(weights[few]).T)
+            )
             return found
 
         def correlations(x: Float[Array, "n dx"], other: Float[Array, "c dx"]) -> Float[Array, "n c"]:
@@ -198,28 +209,29 @@ class Pathwise:
             own = centred(draws)
             mean = jnp.mean(draws[:, :, self.particles :].astype(jnp.float64), axis=2)
             sigma = noise_by_marginal_likelihood(own, mean)
-            variance = sigma**2 + prior.white_variance
+            common = sigma**2 + prior.white_variance
+            variance = common[None] / weights  # of every row: of one that is far off, it is large
             measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
-            noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None, None]
+            noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None]
             seen = measured[:, :, None] + jnp.moveaxis(noise, 0, -1)
             left = (seen - before) * counts[:, None, None]
             correlation = correlations(known, known)
 
             def of_output(
                 given: tuple[
-                    Float[Array, "c N"], Float[Array, "c L"], Float[Array, "c L"], Float[Array, ""], Float[Array, ""]
+                    Float[Array, "c N"], Float[Array, "c L"], Float[Array, "c L"], Float[Array, ""], Float[Array, " c"]
                 ],
             ) -> tuple[Float[Array, "N L"], Float[Array, "c L"], Float[Array, "c L"]]:
                 own, seen, left, kappa, variance = given
                 own = own * counts[:, None]
                 law = own @ own.T + kappa**2 * correlation * counts[:, None] * counts[None]
-                factor = jnp.linalg.cholesky(law + variance * jnp.eye(len(law)))
+                factor = jnp.linalg.cholesky(law + jnp.diag(variance))
                 solved = jax.scipy.linalg.cho_solve((factor, True), left)
-                return own.T @ solved, kappa**2 * solved, seen - variance * solved
+                return own.T @ solved, kappa**2 * solved, seen - variance[:, None] * solved
 
             seen, left = jnp.moveaxis(seen, 1, 0), jnp.moveaxis(left, 1, 0)
-            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance))
-            total = jnp.sqrt(variance).astype(dtype)
+            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance.T))
+            total = jnp.sqrt(common).astype(dtype)
             rho = self.noise.init(total, problem.noise_floor)
             first = networks.init(key_networks)._replace(noise=rho)
             return State(Paths(jax.random.key_data(key_paths), along, at, values), first)
@@ -243,7 +255,7 @@ class Pathwise:
             fresh = len(targets.x) - len(rows)
             chosen = jax.random.randint(key, (self.batch,), 0, fresh + count, jnp.int32)
             h, pull_back = jax.vjp(lambda p: self.network.apply_all(p, targets.x[chosen]), state.networks.particles)
-            sigma = networks.noise_std(state.networks.noise)
+            sigma = networks.noise_scale(state.networks.noise)
             off = (targets.h[:, chosen] - h) / sigma[None, None]
             (ascent,) = pull_back(off / sigma[None, None])
             after = networks.ascended(state.networks, ascent, jnp.zeros_like(sigma))

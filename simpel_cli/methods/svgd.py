@@ -77,7 +77,9 @@ class SVGD:
             weight = problem.m.astype(dtype) / at_least_one(counted)
 
             def fit(particles: Particles, rho: Float[Array, " dy"]) -> Float[Array, ""]:
-                return log_likelihood(self.network.apply_all(particles, x), networks.noise_std(rho), y, counted)
+                return log_likelihood(
+                    self.network.apply_all(particles, x), networks.noise_scale(rho), y, counted, problem.tail
+                )
 
             value, (slope, slope_noise) = jax.value_and_grad(fit, argnums=(0, 1))(state.particles, state.noise)
             prior = jax.grad(lambda p: self.log_prior(p))(state.particles)
@@ -85,7 +87,9 @@ class SVGD:
             flat, unflatten = _flattened(state.particles)
             velocity, mean_kernel = stein_velocity(flat, _flattened(score)[0], self.bandwidth)
             after = networks.ascended(state, unflatten(velocity), weight * slope_noise)
-            info = Info(-value / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
+            info = Info(
+                -value / (at_least_one(counted) * self.particles), networks.noise_scale(state.noise), mean_kernel
+            )
             return after, info
 
         return Inference(networks.init, lambda key, state: None, step, networks.predict, networks.members)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.dynamics.transition import OneStep
 from simpel_cli.errors import ConfigError, check_at_least_one
+from simpel_cli.inference import student_t
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
@@ -90,8 +91,9 @@ class SysID:
 
         def judged(f: Float[Array, "n dy"], u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
             """Return the loss of simulated targets f."""
-            e = (problem.y - f) / sigma(rho)[None]
-            data = jnp.sum(counts * (0.5 * e**2 + jnp.log(sigma(rho))[None]))
+            e = (jnp.asarray(problem.y) - f) / sigma(rho)[None]
+            misfit = 0.5 * e**2 if problem.tails is None else -student_t.log_density(e, problem.tails[None])
+            data = jnp.sum(counts * (misfit + jnp.log(sigma(rho))[None]))
             learned = self.noise.log_prior(rho, problem.noise_init, problem.noise_floor) if self.noise.learn else 0.0
             return data + 0.5 * jnp.sum(jnp.where(gaussian, u**2, 0.0)) - learned
 
@@ -105,9 +107,12 @@ class SysID:
 
         def fisher(slope: Float[Array, "n dy dp"], rho: Float[Array, " dy"]) -> Float[Array, "d d"]:
             """Information of unit coordinates and noise."""
-            slope = slope / sigma(rho)[None, :, None]
+            slope, of_scale = slope / sigma(rho)[None, :, None], jnp.full((dim_y,), 2.0, dtype)
+            if problem.tails is not None:
+                of_location, of_scale = student_t.information(problem.tails)
+                slope = slope * jnp.sqrt(of_location)[None, :, None]
             of_u = jnp.einsum("nki,nkj->ij", slope * counts[:, :, None], slope) + jnp.diag(gaussian.astype(dtype))
-            of_log = 2 * problem.m.astype(dtype) + 1 / self.noise.prior_std**2
+            of_log = of_scale * problem.m.astype(dtype) + 1 / self.noise.prior_std**2
             bend = jax.nn.sigmoid(rho) / sigma(rho)  # d log sigma / d rho
             return jax.scipy.linalg.block_diag(of_u, jnp.diag(of_log * bend**2))
 
@@ -186,7 +191,7 @@ class SysID:
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             u, noise_std = drawn(state)
             h = jax.vmap(simulated, in_axes=(0, None))(u, x)
-            return Predictive(scale.y_to_data(h), noise_std * scale.y_std)
+            return Predictive(scale.y_to_data(h), noise_std * scale.y_std, problem.tails)
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
             return scale.y_to_data(jax.vmap(simulated)(drawn(state)[0], x))

@@ -70,6 +70,48 @@ def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], r
     return Spectrum(jnp.maximum(values, 0.0), vectors, turned, counts.shape[0] - jnp.sum(counts))
 
 
+def weighted_spectra(
+    correlation: Float[Array, "m m"],
+    residual: Float[Array, "m dy"],
+    rows: Int[Numbers, ""],
+    weights: Float[Numbers, "m dy"] | None,
+) -> Spectrum:
+    """Return the spectrum of every output, leading axis dy, of rows that count by their weights; None: all alike.
+
+    Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I).
+    """
+    if weights is None:
+        return jax.tree.map(lambda a: a[None], spectrum(correlation, residual, rows))
+    root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
+
+    def of_output(root: Float[Array, " m"], left: Float[Array, " m"]) -> Spectrum:
+        return spectrum(correlation * root[:, None] * root[None], (left * root)[:, None], rows)
+
+    found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T))
+    return found
+
+
+def best_of_each(
+    given: Spectrum,
+    kappa: Float[Numbers, " dy"] | None,
+    white: float,
+    prior_std: float | None,
+    floor: Float[Numbers, " dy"],
+    typical: Float[Numbers, " dy"],
+) -> MarginalLikelihoodFit:
+    """Return `best_scales` of spectra with a leading axis: 1, common to all outputs, or dy, one each."""
+    if given.values.shape[0] == 1:
+        return best_scales(jax.tree.map(lambda a: a[0], given), kappa, white, prior_std, floor, typical)
+
+    def of_output(one: Spectrum, scales: tuple[Array, ...]) -> MarginalLikelihoodFit:
+        *known, floor, typical = scales
+        return best_scales(one, known[0] if known else None, white, prior_std, floor, typical)
+
+    alone = tuple(jnp.asarray(a)[:, None] for a in (kappa, floor, typical) if a is not None)
+    found = jax.vmap(of_output)(given, alone)
+    return MarginalLikelihoodFit(*(a[:, 0] for a in found))
+
+
 def best_scales(
     given: Spectrum,
     kappa: Float[Numbers, " dy"] | None,
@@ -129,6 +171,7 @@ def noise_of_smooth(
     prior_std: float,
     floor: Float[Numbers, " dy"],
     typical: Float[Numbers, " dy"],
+    weights: Float[Numbers, "m dy"] | None = None,
 ) -> Float[Array, " dy"]:
     """Return what a smooth function leaves of the residuals, where neither its size nor its lengthscale is known.
 
@@ -143,9 +186,11 @@ def noise_of_smooth(
         prior_std: of log sigma; see `best_scales`.
         floor: smallest noise.
         typical: its typical value.
+        weights: of the rows; see `weighted_spectra`.
     """
+    left = jnp.asarray(residual)
     found = [
-        best_scales(spectrum(correlation(f), jnp.asarray(residual), rows), None, white, prior_std, floor, typical)
+        best_of_each(weighted_spectra(correlation(f), left, rows, weights), None, white, prior_std, floor, typical)
         for f in LONGER
     ]
     noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))

@@ -14,7 +14,7 @@ from simpel_cli.inference.protocols import Method
 from simpel_cli.reporting.figures import draw_run
 from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.reporting.prior_check import describe_prior
-from simpel_cli.reporting.run_table import named_method, run_table
+from simpel_cli.reporting.run_table import law_of_noise, named_method, run_table
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed
 from simpel_cli.runs.manifest import Manifest
@@ -52,6 +52,7 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (black box)"
     terminal.line(f"{source.name}{kind}   uncertain parameters: {uncertain}   {_gap_text(study, fitted)}", "simulator")
+    terminal.line(law_of_noise(study, fitted), "noise")
     if checked is not None:
         describe_prior(terminal, checked)
 

@@ -31,6 +31,7 @@ def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) 
         ("gap scale kappa", _kappa(study, fitted)),
         ("distinct particles", _distinct(study, judged.distinct)),
         ("learned noise", _per_output(study, judged.noise_std)),
+        ("law of the noise", law_of_noise(study, fitted)),
         ("device", f"{manifest.facts.get('device', study.device)}, {study.settings.precision}"),
         ("time", _time(manifest)),
         ("software", ", ".join(f"{name} {version}" for name, version in software.items() if version)),
@@ -53,6 +54,23 @@ def _kappa(study: Study, fitted: Fitted) -> str:
         return "no gap GP"
     scale = np.asarray(fitted.assembled.problems.gap_scale, dtype=float)
     return _per_output(study, scale * fitted.target_std)
+
+
+def law_of_noise(study: Study, fitted: Fitted) -> str:
+    """Return the law of the noise, and what it was chosen by."""
+    problems, gain, asked = fitted.assembled.problems, fitted.assembled.heavy_tails, study.measurements.law
+    if problems.tail is None:
+        if asked != "auto":
+            return "Gaussian, as data.noise.law says"
+        if np.isnan(gain):
+            return "Gaussian: too few rows to ask for another law (data.noise.law)"
+        ahead = f"ahead by {gain:.1f} nats only" if gain > 0 else f"behind by {-gain:.1f} nats"
+        return f"Gaussian: Student's t is {ahead} in leave-one-out log score"
+    said = "as data.noise.law says" if asked != "auto" else f"ahead by {gain:.1f} nats of leave-one-out log score"
+    freedom = (1 / np.asarray(problems.tail, dtype=float)).mean(axis=0)
+    names = study.system.encoding.y_names
+    degrees = ", ".join(f"{name} {value:.2g}" for name, value in zip(names, freedom, strict=True))
+    return f"Student's t, {said}; degrees of freedom: {degrees}"
 
 
 def _distinct(study: Study, numbers: list[float]) -> str:

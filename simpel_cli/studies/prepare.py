@@ -66,6 +66,7 @@ def prepare(study: Study) -> Fitted:
         pool=study.method.pool,
         keys=[stream(seed, "prior") for seed in settings.all_seeds],
         precision=settings.precision,
+        law=measurements.law,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
     return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)

@@ -14,7 +14,8 @@ from simpel_cli.studies.open import Study
 from simpel_cli.studies.prepare import Fitted
 
 LOG_EVERY = 50  # steps per row of the metric table
-DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor")  # of a problem: drawn or chosen, not measured
+# of a problem: drawn or chosen, not measured
+DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor", "tail", "weights")
 
 
 def train(
@@ -69,7 +70,8 @@ def _kept(fitted: Fitted, state: Any) -> dict[str, Any]:
     Another version of JAX may draw another normaliser; networks that were trained in one are worth nothing in another.
     """
     problems = fitted.assembled.problems
-    return {"state": state, "problem": {name: getattr(problems, name) for name in DRAWN}}
+    drawn = {name: getattr(problems, name) for name in DRAWN}
+    return {"state": state, "problem": {name: value for name, value in drawn.items() if value is not None}}
 
 
 def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitted]:

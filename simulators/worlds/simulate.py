@@ -18,7 +18,7 @@ import numpy as np
 
 from simulators.model import TIE, Model, ModelError, Quantity
 from simulators.parameters import draw
-from simulators.quantity import check_word, refuse_unknown
+from simulators.quantity import BETWEEN_ROWS, check_word, refuse_unknown
 from simulators.worlds.excitation import Excitation, HeldRandom
 from simulators.worlds.groups import Covariate, Dealt, Group, Groups
 from simulators.worlds.motion import Drifting, Inputs, check_finite, named, true_values
@@ -32,7 +32,6 @@ from simulators.worlds.world import World
 OWN_COLUMNS = ("episode", "t", "split")
 LAYOUTS = ("trajectories", "transitions")
 NOISE_ON = ("both", "next")
-BETWEEN_ROWS = ("held", "linear")
 NEXT = ("next_", "exact_next_")  # of the columns of layout transitions
 LICENCE = "made by simpel simulate: simulated data, not measured on a real system"
 
@@ -81,7 +80,8 @@ class Simulate:
         rates: state or output -> s between two samples of its sensor; NaN in the rows between.
         clocks: state or output -> its sensor samples at times of its own: {offset, drift}. They become rows.
         jitter: share of dt by which the times of rows vary at random.
-        between_rows: input -> how the plant sees it between rows: held, or linear from row to row; held where left out.
+        between_rows: input -> how the plant sees it between rows: held, or linear from row to row; where left out, as the
+            simulator says.
         groups: column -> groups to which episodes are dealt in turn, and parameters that differ between them.
         covariates: column -> a known number that differs between episodes, the value of a parameter.
         drift: parameter -> its relative change from the beginning to the end of an episode, linear in time.
@@ -140,6 +140,8 @@ class Simulate:
             ModelError: a name that the source does not have, a range upside down, or a state that is not finite.
 
         """
+        if isinstance(source, Model) and source.between_rows.keys() - self.between_rows.keys():
+            return dataclasses.replace(self, between_rows=source.between_rows | self.between_rows).run(source)
         own = OWN_COLUMNS if self.layout == "trajectories" else OWN_COLUMNS[-1:]
         for quantity in (*source.states, *source.inputs, *source.outputs):
             if quantity.name in own:

@@ -1,0 +1,176 @@
+"""Scales of the gap and of the noise, and the law of the noise, chosen by what the training transitions say under the prior."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Normaliser
+from simpel_cli.inference.system import System
+from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.marginal_likelihood import TYPICAL_SCALE, noise_of_smooth
+from simpel_cli.priors.noise_law import LEAST_GAIN, LEAST_ROWS, TAILS, Law, Moments, gain_of_tails, student_t
+
+SCALE_POINTS, SCALE_DRAWS = 512, 512
+WORLD_SCALE_POINTS = 128
+
+
+class Chooser(NamedTuple):
+    """A prior and what is measured, for which scales are chosen.
+
+    Args:
+        prior: as declared.
+        bound: to the simulator.
+        system: simulator and coordinates.
+        normaliser: of the system.
+        noise: of the likelihood.
+        noise_init: typical noise, normalised, (dy,).
+    """
+
+    prior: SimulatorPrior | GPPrior
+    bound: FunctionPrior
+    system: System
+    normaliser: Normaliser
+    noise: NoiseModel
+    noise_init: np.ndarray
+
+    @property
+    def most_rows(self) -> int:
+        """Rows that are looked at together."""
+        queries = self.prior.uses_simulator and self.system.transition is None
+        return WORLD_SCALE_POINTS if queries else SCALE_POINTS
+
+    @property
+    def given(self) -> np.ndarray:
+        """Declared kappa, normalised, NaN where it is to be chosen, (dy,)."""
+        gap: GapGP | None = self.prior.gap
+        given = np.zeros(self.system.encoding.dim_y)
+        if gap is not None:
+            given = given + (np.nan if isinstance(gap.scale, str) else gap.scale)
+            if gap.scale == "declared":
+                given = self.system.encoding.per_target(self.system.source.gap, np.nan) / self.normaliser.y_std
+        return given
+
+    def correlation(self, x: np.ndarray, longer: float = 1.0) -> Array:
+        """Correlation per output at inputs (m, dx), of a lengthscale so many times the declared one."""
+        normalised = (x - self.normaliser.x_mean) / self.normaliser.x_std
+        other = self.bound._replace(white_variance=0.0, input_scale=np.asarray(self.bound.input_scale) / longer)
+        return other.covariance(jnp.asarray(normalised), jnp.ones(self.system.encoding.dim_y))
+
+    def moments(self, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray) -> Moments:
+        """Return the prior at rows: inputs (m, dx), normalised targets (m, dy)."""
+        samples = np.zeros((2, *targets.shape))
+        if self.prior.uses_simulator:
+            drawn = self.system.simulate(key, x, SCALE_DRAWS)
+            samples = (drawn - self.normaliser.y_mean) / self.normaliser.y_std
+        return Moments(samples, np.asarray(self.correlation(x)[0]), targets, self.prior.white_variance)
+
+
+class Chosen(NamedTuple):
+    """Of one set of training rows.
+
+    Args:
+        gap: kappa, normalised, (dy,).
+        noise: sigma of the largest marginal likelihood, 0 where it is not asked for, (dy,).
+        law: Student's t noise, weights of all rows; None: Gaussian.
+    """
+
+    gap: np.ndarray
+    noise: np.ndarray
+    law: Law | None
+
+
+class Looked(NamedTuple):
+    """What Gaussian noise comes to in the rows that were looked at.
+
+    Args:
+        gap, noise: kappa and sigma, normalised, (dy,).
+        rows: that were looked at; None: there were none, or nothing was to be chosen.
+        moments: of the prior there.
+        gain: nats by which every tail of Student's t is ahead, (T,).
+    """
+
+    gap: np.ndarray
+    noise: np.ndarray
+    rows: np.ndarray | None
+    moments: Moments | None
+    gain: np.ndarray
+
+
+def chosen(
+    chooser: Chooser, training: list[tuple[np.ndarray, np.ndarray]], keys: list[PRNGKeyArray], law: str
+) -> tuple[list[Chosen], float]:
+    """Choose scales for every set of training rows, and one law of the noise for all of them.
+
+    Args:
+        chooser: prior and system.
+        training: inputs (m, dx) and normalised targets (m, dy) of every seed.
+        keys: one per seed.
+        law: of the noise: gaussian, student_t, or auto: what the data say.
+
+    Returns:
+        The choices, and the nats by which Student's t is ahead of the Gaussian, per seed; NaN: it was not looked at.
+    """
+    looked = [_looked(chooser, x, y, key, law) for (x, y), key in zip(training, keys, strict=True)]
+    gain = np.mean([one.gain for one in looked], axis=0).max()
+    if law == "gaussian" or looked[0].moments is None or (law == "auto" and not gain > LEAST_GAIN):
+        return [Chosen(one.gap, one.noise, None) for one in looked], float(gain)
+    return [_heavy(chooser, one, x, y) for one, (x, y) in zip(looked, training, strict=True)], float(gain)
+
+
+def _looked(chooser: Chooser, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray, law: str) -> Looked:
+    """Kappa is what the prior declares; what it does not is chosen by marginal likelihood, as sigma is."""
+    size, noise, given = chooser.system.encoding.dim_y, chooser.noise, chooser.given
+    unknown = np.full(len(TAILS), np.nan)
+    # of more rows than are looked at networks learn the noise better than those tell it
+    with_noise = noise.learn and noise.marginal_share > 0 and 0 < len(x) <= chooser.most_rows
+    with_law = law != "gaussian" and noise.learn and (len(x) >= LEAST_ROWS or law == "student_t")
+    if len(x) == 0:  # nothing to choose by
+        return Looked(np.where(np.isnan(given), TYPICAL_SCALE, given), np.zeros(size), None, None, unknown)
+    if not (np.isnan(given).any() or with_noise or with_law):
+        return Looked(given, np.zeros(size), None, None, unknown)
+    rows = np.arange(len(x))
+    if len(x) > chooser.most_rows:  # the first ones may all be of one episode
+        key, key_rows = jax.random.split(key)
+        rows = np.asarray(jax.random.choice(key_rows, len(x), (chooser.most_rows,), replace=False))
+    moments = chooser.moments(x[rows], targets[rows], key)
+    found = [
+        marginal_likelihood_scales(
+            moments.samples[:, :, i], moments.correlation, moments.targets[:, i], chooser.noise_init[i], moments.white,
+            None if np.isnan(given[i]) else float(given[i]),
+        )
+        for i in range(size)
+    ]  # fmt: skip
+    scale, sigma = (np.array(values) for values in zip(*found, strict=True))
+    gain = gain_of_tails(moments, scale, sigma) if with_law else unknown
+    if with_noise:
+        sigma = _smooth(chooser, x[rows], moments, sigma)
+    return Looked(scale, sigma if with_noise or with_law else np.zeros(size), rows, moments if with_law else None, gain)
+
+
+def _smooth(
+    chooser: Chooser, x: np.ndarray, moments: Moments, sigma: np.ndarray, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """Return a noise that is no less than what a smooth function leaves, where there is no simulator."""
+    if chooser.prior.uses_simulator:
+        return sigma
+    left = noise_of_smooth(
+        lambda longer: chooser.correlation(x, longer)[0], moments.targets, np.array(len(x), np.int32), moments.white, 1.0,
+        np.full(len(sigma), 1e-3), chooser.noise_init, weights,
+    )  # fmt: skip
+    return np.maximum(sigma, np.asarray(left))
+
+
+def _heavy(chooser: Chooser, looked: Looked, x: np.ndarray, targets: np.ndarray) -> Chosen:
+    """Return the choice for noise that is Student's t."""
+    assert looked.moments is not None
+    assert looked.rows is not None
+    law = student_t(looked.moments, looked.gap, looked.noise, chooser.noise_init, given=chooser.given)
+    scale = _smooth(chooser, x[looked.rows], looked.moments, law.scale, law.weights)
+    weights = np.ones(targets.shape)
+    weights[looked.rows] = law.weights
+    return Chosen(law.gap, scale, law._replace(weights=weights, scale=scale))

@@ -1,0 +1,175 @@
+"""The law of the measurement noise, Gaussian or Student's t, by the leave-one-out log score of the training transitions.
+
+Under the prior's moments, y ~ N(mean(g), C + sigma^2 W^-1), C = cov(g) + (kappa^2 R + w I), the error of row j where it is left
+out and its variance are
+
+    e_j = [A^-1 r]_j / [A^-1]_jj,    v_j = 1/[A^-1]_jj,    A = C + sigma^2 W^-1,    r = y - mean(g)
+
+so that e_j/sqrt(v_j) is a held-out sample of the law. Which law, is asked of all outputs together, with one tail 1/nu and a
+scale per output: fifty rows of one output seldom hold an outlier. If it is Student's t, weights W, scales and tails follow by
+expectation and conditional maximisation; every tail has a normal prior about the common one.
+
+Reference: Rasmussen and Williams (2006), eqs. 5.10-5.12 (leave one out); Liu and Rubin (1995), ML estimation of the t
+distribution using EM and its extensions, ECM and ECME, Statistica Sinica 5 (the tail by the likelihood itself).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaln
+
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+
+TAILS = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45])  # 1/nu
+SCALES = np.geomspace(0.2, 2.0, 47)  # of the errors' standard deviations
+SPREAD = 0.1  # of an output's tail about the common one
+LEAST_GAIN = 3.0  # nats that Student's t has to be ahead by
+LEAST_ROWS = 20  # fewer tell nothing of a tail
+ROUNDS = 8
+
+
+class Law(NamedTuple):
+    """Student's t noise of every output.
+
+    Args:
+        tail: 1/nu, (dy,).
+        weights: expected weight of every row, (m, dy).
+        gap: kappa with these weights, normalised, (dy,).
+        scale: sigma, normalised, (dy,).
+    """
+
+    tail: np.ndarray
+    weights: np.ndarray
+    gap: np.ndarray
+    scale: np.ndarray
+
+
+class Moments(NamedTuple):
+    """The prior at the training rows, normalised.
+
+    Args:
+        samples: draws of the simulator, (N, m, dy).
+        correlation: of the gap, (m, m).
+        targets: measured, (m, dy).
+        white: white model error of the prior, a variance.
+    """
+
+    samples: np.ndarray
+    correlation: np.ndarray
+    targets: np.ndarray
+    white: float
+
+    def of_output(self, i: int, kappa: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return covariance of the function, (m, m), and residual, (m,)."""
+        covariance = np.atleast_2d(np.cov(self.samples[:, :, i], rowvar=False))
+        covariance = covariance + kappa**2 * self.correlation + self.white * np.eye(len(self.correlation))
+        return covariance, self.targets[:, i] - self.samples[:, :, i].mean(axis=0)
+
+
+class LeftOut(NamedTuple):
+    """What the other rows say of every row, (m,) each.
+
+    Args:
+        error: of the row where it is left out.
+        function: variance of the function there, without the noise.
+        squared: expected square of the row's noise, where it is not left out.
+    """
+
+    error: np.ndarray
+    function: np.ndarray
+    squared: np.ndarray
+
+
+def left_out(covariance: np.ndarray, residual: np.ndarray, variance: np.ndarray) -> LeftOut:
+    """Leave out every row in turn; variance: of the noise per row, (m,)."""
+    inverse = np.linalg.inv(covariance + np.diag(variance))
+    diagonal = np.diag(inverse)
+    pull = inverse @ residual
+    squared = (variance * pull) ** 2 + np.maximum(variance - variance**2 * diagonal, 0.0)
+    return LeftOut(pull / diagonal, np.maximum(1 / diagonal - variance, 0.0), squared)
+
+
+def profile(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the log score of standardised errors (m,) for Gaussian noise and every tail, each at its best scale.
+
+    Both results are (1 + T,); the first entry is the Gaussian's. A scale is a multiple of the errors' standard deviation; its
+    logarithm has the prior N(0, 1).
+    """
+    tau = TAILS[:, None, None]
+    u = z[None, None, :] / SCALES[None, :, None]
+    constant = gammaln((1 / tau + 1) / 2) - gammaln(1 / tau / 2) + 0.5 * np.log(tau / np.pi)
+    heavy = np.sum(constant - (1 / tau + 1) / 2 * np.log1p(tau * u**2), axis=2)
+    light = np.sum(-0.5 * u[:1] ** 2 - 0.5 * np.log(2 * np.pi), axis=2)
+    scores = np.concatenate([light, heavy]) - len(z) * np.log(SCALES)[None] - 0.5 * np.log(SCALES)[None] ** 2
+    best = np.argmax(scores, axis=1)
+    return np.take_along_axis(scores, best[:, None], axis=1)[:, 0], SCALES[best]
+
+
+def gain_of_tails(moments: Moments, kappa: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Return by how many nats every tail, common to all outputs, is ahead of the Gaussian, (T,).
+
+    Args:
+        moments: of the prior.
+        kappa: scale of the gap, (dy,).
+        sigma: Gaussian noise, (dy,).
+    """
+    total = np.zeros(len(TAILS))
+    for i in range(len(sigma)):
+        covariance, residual = moments.of_output(i, kappa[i])
+        found = left_out(covariance, residual, np.full(len(residual), sigma[i] ** 2))
+        scores, _ = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))
+        total += scores[1:] - scores[0]
+    return total
+
+
+def student_t(
+    moments: Moments, kappa: np.ndarray, sigma: np.ndarray, noise_init: np.ndarray, *, given: np.ndarray
+) -> Law:
+    """Return the law where it is Student's t.
+
+    Args:
+        moments: of the prior.
+        kappa: scale of the gap for Gaussian noise, (dy,).
+        sigma: Gaussian noise, (dy,), where to begin.
+        noise_init: its typical value, (dy,).
+        given: kappa where it is declared, NaN where it is chosen, (dy,).
+    """
+    m, size = moments.targets.shape
+    kappa, sigma = kappa.copy(), sigma.copy()
+    weights, tail = np.ones((m, size)), np.full(size, 0.25)
+    for turn in range(ROUNDS):
+        scores = np.zeros((size, len(TAILS)))
+        squared = np.zeros((m, size))
+        for i in range(size):
+            if turn and np.isnan(given[i]) and turn % 3 == 1:
+                kappa[i], sigma[i] = _weighted_scales(moments, i, weights[:, i], noise_init[i])
+            covariance, residual = moments.of_output(i, kappa[i])
+            found = left_out(covariance, residual, sigma[i] ** 2 / weights[:, i])
+            scores[i] = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))[0][1:]
+            squared[:, i] = found.squared
+        tail = _tails(scores)
+        weights = (1 + tail) / (1 + tail * squared / sigma**2)
+        # M-step of the scale with its prior, log sigma ~ N(log noise_init, 1), which decides where there are few rows
+        data = np.sum(weights * squared, axis=0) / m
+        sigma = np.exp((m * np.log(data) / 2 + np.log(noise_init) / 2) / (m + 0.5))
+    return Law(tail, weights, kappa, sigma)
+
+
+def _tails(scores: np.ndarray) -> np.ndarray:
+    """Return every output's most probable tail, its prior centred on the common one; scores: (dy, T)."""
+    common = TAILS[int(np.argmax(scores.sum(axis=0)))]
+    prior = -0.5 * ((TAILS - common) / SPREAD) ** 2
+    posterior = scores + prior[None]
+    mass = np.exp(posterior - posterior.max(axis=1, keepdims=True))
+    found: np.ndarray = (mass * TAILS[None]).sum(axis=1) / mass.sum(axis=1)
+    return found
+
+
+def _weighted_scales(moments: Moments, i: int, weights: np.ndarray, noise_init: float) -> tuple[float, float]:
+    """Return kappa and sigma of the largest marginal likelihood with rows that count by their weights."""
+    root = np.sqrt(weights)
+    scales = marginal_likelihood_scales(
+        moments.samples[:, :, i] * root[None], moments.correlation * np.outer(root, root), moments.targets[:, i] * root,
+        noise_init, moments.white,
+    )  # fmt: skip
+    return scales.gap, scales.noise
