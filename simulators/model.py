@@ -8,19 +8,18 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from graphlib import CycleError, TopologicalSorter
 from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.expression import ExpressionError, Symbol, symbols_used
+from simulators.definitions import evaluated, in_order, read_intermediates, read_parameters
+from simulators.expression import Symbol
 from simulators.quantity import (
     LIMITS,
     TIMES,
     ModelError,
     Quantity,
     check_free,
-    check_keys,
     check_mapping,
     check_model_name,
     check_spelling,
@@ -30,8 +29,6 @@ from simulators.quantity import (
     read_output,
     read_term,
     read_times,
-    read_uncertain,
-    read_unit,
     read_variable,
     refuse_unknown,
 )
@@ -189,7 +186,9 @@ class Declared:
             slowly an input acts.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
-        dynamics: state: expression of its time derivative, in states, inputs and parameters.
+        intermediates: name: expression, or {unit, expression}, in states, inputs, parameters and other intermediates, in any
+            order; a name that dynamics and outputs can use.
+        dynamics: state: expression of its time derivative, in states, inputs, parameters and intermediates.
         outputs: name: expression, or {unit, expression}; a measured quantity that is not a state.
         gap: state or output: expected model error of one transition, in its unit.
 
@@ -204,6 +203,7 @@ class Declared:
     states: dict[str, Any] = field(default_factory=dict)
     inputs: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
+    intermediates: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
@@ -232,16 +232,18 @@ class Declared:
                 "sim.states: neither states nor outputs: declare a state, or an output of a static function"
             )
         self._check_dynamics()
-        params, fixed, derived = self._parameters()
+        params, fixed, derived = read_parameters(self.parameters)
+        defined = in_order(read_intermediates(self.intermediates), "write one of them without the others")
         measured = {name: read_expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
 
         def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
             scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
             for group, column in ((states, x), (inputs, u), (params, p)):
                 scope |= {quantity.name: column[row] for row, quantity in enumerate(group)}
-            for name, formula in derived.items():
-                scope[name] = read_term(f"sim.parameters.{name}", formula, scope)
-            return scope
+            return evaluated(derived, scope)
+
+        def whole(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            return evaluated(defined, known(x, u, p))
 
         def outputs_of(scope: dict[str, Symbol]) -> list[Symbol]:
             return [read_term(f"sim.outputs.{name}", formula, scope) for name, formula in measured.items()]
@@ -254,8 +256,8 @@ class Declared:
             inputs=inputs,
             params=params,
             outputs=outputs,
-            rhs=lambda x, u, p: column(self.symbol, self.rates(known(x, u, p))),
-            output=lambda x, u, p: column(self.symbol, outputs_of(known(x, u, p))),
+            rhs=lambda x, u, p: column(self.symbol, self.rates(whole(x, u, p))),
+            output=lambda x, u, p: column(self.symbol, outputs_of(whole(x, u, p))),
             gap=self._gap(),
             fixed=fixed,
             delay=read_times("delay", self.inputs, params, fixed),
@@ -284,7 +286,7 @@ class Declared:
 
     def _check_names(self) -> None:
         taken: dict[str, str] = {}
-        for section in ("states", "inputs", "parameters", "outputs", "dynamics", "gap"):
+        for section in ("states", "inputs", "parameters", "intermediates", "outputs", "dynamics", "gap"):
             path, node = f"sim.{section}", getattr(self, section)
             check_mapping(path, node)
             for name in node:
@@ -320,54 +322,6 @@ class Declared:
             if gap[name] < 0:
                 raise ModelError(f"sim.gap.{name}: {gap[name]:g} is negative; give a standard deviation, 0 for none")
         return gap
-
-    def _parameters(self) -> tuple[tuple[Quantity, ...], dict[str, float], dict[str, str]]:
-        """Return the uncertain ones, the known numbers, and the derived expressions in an order of evaluation."""
-        uncertain: list[Quantity] = []
-        fixed: dict[str, float] = {}
-        formulas: dict[str, str] = {}
-        for name, node in self.parameters.items():
-            path = f"sim.parameters.{name}"
-            if isinstance(node, str):
-                formulas[name] = node
-            elif not isinstance(node, Mapping):
-                fixed[name] = read_number(path, node)
-            elif "value" in node:
-                check_keys(path, node, ("unit", "value"), "a known parameter takes no range")
-                read_unit(path, node)
-                fixed[name] = read_number(f"{path}.value", node["value"])
-            else:
-                check_keys(
-                    path, node, ("unit", "range", "prior"), "`value: <number>` in place of a range makes it known"
-                )
-                uncertain.append(read_uncertain(path, name, node))
-        derived: dict[str, str] = {}
-        for name in self._order(formulas):
-            if symbols_used(formulas[name]) <= fixed.keys():
-                scope = {other: casadi.SX(value) for other, value in fixed.items()}
-                fixed[name] = float(read_term(f"sim.parameters.{name}", formulas[name], scope))
-            else:
-                derived[name] = formulas[name]
-        return tuple(uncertain), fixed, derived
-
-    def _order(self, formulas: Mapping[str, str]) -> list[str]:
-        uses: dict[str, set[str]] = {}
-        for name, formula in formulas.items():
-            path = f"sim.parameters.{name}"
-            try:
-                uses[name] = symbols_used(formula)
-            except ExpressionError as error:
-                raise ModelError(f"{path}: {error}") from None
-            for other in sorted(uses[name] - self.parameters.keys()):
-                refuse_unknown(path, f"uses {other}, which is no parameter", other, self.parameters)
-        try:
-            order = list(TopologicalSorter(uses).static_order())
-        except CycleError as error:
-            loop = " -> ".join(reversed(error.args[1]))
-            raise ModelError(
-                f"sim.parameters: derived in a circle, {loop}; give one of them a number or a range"
-            ) from None
-        return [name for name in order if name in formulas]
 
 
 def column(symbol: Any, rows: list[Symbol]) -> Symbol:
