@@ -46,10 +46,11 @@ class Built(Declared, ABC):
                 refuse_unknown(f"sim.{section}.{spare[0]}", f"the equations of {kind} do not use it", spare[0], names)
 
     def _used(self) -> set[str]:
-        """Return the names that derived parameters, intermediates, outputs, delays and lags refer to."""
+        """Return the names that derived parameters, intermediates, tables, outputs, delays and lags refer to."""
         named = [*self.intermediates.values(), *self.outputs.values()]
         formulas = [node for node in self.parameters.values() if isinstance(node, str)]
         formulas += [str(node.get("expression", "") if isinstance(node, dict) else node) for node in named]
+        formulas += [str(name) for node in self.tables.values() for name in dict(node).get("inputs", ())]
         times = [node.get(key) for node in self.inputs.values() for key in ("delay", "lag") if isinstance(node, dict)]
         return {name for formula in formulas for name in symbols_in(formula)} | {t for t in times if isinstance(t, str)}
 

@@ -1,5 +1,6 @@
 """A simulator with terms added to it: what `simpel discover` writes where the equations are in Python, not in YAML."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -57,7 +58,10 @@ class Extended:
     def model(self) -> Model:
         """Check everything and build the model."""
         check_model_name(self.name)
-        base = self.base.model()
+        try:
+            base = self.base.model()
+        except ModelError as error:
+            raise ModelError(re.sub(r"^sim\.", "sim.base.", str(error))) from None
         if not isinstance(base, Model):
             raise ModelError(
                 "sim.base: a world shows no equations that terms could be added to; give a simulator in symbols"

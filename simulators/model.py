@@ -32,6 +32,7 @@ from simulators.quantity import (
     read_variable,
     refuse_unknown,
 )
+from simulators.tables import read_tables
 
 __all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
 
@@ -186,9 +187,11 @@ class Declared:
             slowly an input acts.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
-        intermediates: name: expression, or {unit, expression}, in states, inputs, parameters and other intermediates, in any
-            order; a name that dynamics and outputs can use.
-        dynamics: state: expression of its time derivative, in states, inputs, parameters and intermediates.
+        intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
+            in any order; a name that dynamics and outputs can use.
+        tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
+            intermediates, whose value is looked up (see `simulators.tables`).
+        dynamics: state: expression of its time derivative, in all these names.
         outputs: name: expression, or {unit, expression}; a measured quantity that is not a state.
         gap: state or output: expected model error of one transition, in its unit.
 
@@ -204,6 +207,7 @@ class Declared:
     inputs: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
     intermediates: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
@@ -233,7 +237,9 @@ class Declared:
             )
         self._check_dynamics()
         params, fixed, derived = read_parameters(self.parameters)
-        defined = in_order(read_intermediates(self.intermediates), "write one of them without the others")
+        sections = (self.states, self.inputs, self.parameters, self.intermediates, self.tables)
+        tables = read_tables(self.tables, (name for section in sections for name in section))
+        defined = in_order(read_intermediates(self.intermediates) | tables, "write one of them without the others")
         measured = {name: read_expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
 
         def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
@@ -286,7 +292,7 @@ class Declared:
 
     def _check_names(self) -> None:
         taken: dict[str, str] = {}
-        for section in ("states", "inputs", "parameters", "intermediates", "outputs", "dynamics", "gap"):
+        for section in ("states", "inputs", "parameters", "intermediates", "tables", "outputs", "dynamics", "gap"):
             path, node = f"sim.{section}", getattr(self, section)
             check_mapping(path, node)
             for name in node:

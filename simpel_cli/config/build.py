@@ -72,7 +72,12 @@ def build_source(node: Any, path: str, plugins: tuple[str, ...] = ()) -> Any:
     try:
         return declared.model()
     except ValueError as error:  # simulators.model.ModelError
-        raise ConfigError(str(error)) from error
+        raise ConfigError(of_group(str(error), path)) from error
+
+
+def of_group(message: str, group: str) -> str:
+    """Return what a simulator says of `sim.KEY` with the name of the group that it is declared in."""
+    return f"{group}.{message.removeprefix('sim.')}" if message.startswith("sim.") else message
 
 
 def build_settings(config: Mapping[str, Any]) -> Any:

@@ -8,16 +8,20 @@ import os
 import secrets
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from simpel_cli.config.build import of_group
 from simpel_cli.config.folders import conf_dir, example_data_dir, recordings_dir, require_recordings
+from simpel_cli.config.group_classes import SIMULATORS
 from simpel_cli.config.groups import BROUGHT, CONTROL, group_folder, keys_of_other_verbs, top_level, user_conf
 from simpel_cli.config.hydra_errors import translated, unknown_root
 from simpel_cli.config.overrides import checked, swept_keys, value_of
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import refuse_occupied
+from simulators.quantity import ModelError
+from simulators.table_files import with_files_read
 
 
 class Job(typing.NamedTuple):
@@ -78,6 +82,7 @@ def launch(
                     raise ConfigError(unknown_root(str(key), verb, known))
                 del plain[key]
             folder = group_folder("data", hydra_config.runtime.choices.get("data"), user)
+            _read_tables(plain, hydra_config.runtime.choices, user)
             require_recordings(plain.get("data"))
             directory = Path(hydra_config.runtime.output_dir)
             if config_dir is not None and "choices" in plain:
@@ -117,6 +122,17 @@ def launch(
         sys.argv = before
     if failure is not None:  # raised here, so that no traceback shows our detour
         raise failure
+
+
+def _read_tables(config: dict[str, Any], choices: Mapping[str, Any], user: Path | None) -> None:
+    """Put the numbers of tables in place of their files, so that the configuration needs nothing beside it."""
+    for key in (key for key in SIMULATORS if isinstance(config.get(key), dict)):
+        chosen = choices.get("sim" if key == "sim" else f"sim@{key}")
+        folders = [group_folder("sim", chosen, user), group_folder("experiment", choices.get("experiment"), user)]
+        try:
+            config[key] = with_files_read(config[key], [*folders, Path.cwd()])
+        except ModelError as error:
+            raise ConfigError(of_group(str(error), key)) from error
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from simpel_cli.config.resolved import load
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
 from simpel_cli.runs.console import Terminal, aligned
 from simulators.quantity import ModelError
+from simulators.table_files import with_files_read
 
 WIDTH = 48  # of a list of names in the table
 DECLARED = "simulators.model.Declared"
@@ -87,7 +88,8 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     from simpel_cli.config.build import build
 
     try:
-        model = build(entry.node, "sim", plugins).model()
+        node = with_files_read(entry.node, [entry.path.parent, Path.cwd()])
+        model = build(node, "sim", plugins).model()
     except ModelError as error:
         raise ConfigError(f"{entry.path}: {error}") from error
     terminal.line(entry.comment)
