@@ -181,8 +181,9 @@ class Declared:
         name: letters, digits and single underscores.
         dt: duration of one transition, s.
         substeps: RK4 steps per transition.
-        states: name: {unit, range: [low, high], periodic: false, limits: [low, high]}; none for a static function. What
+        states: name: {unit, range: [low, high], periodic: false, limits: [low, high], role}; none for a static function. What
             leaves the `limits` is put back after each Runge-Kutta step (null: no limit), e.g. a level that cannot be negative.
+            `role`: position, velocity, level, temperature or other; says which effects can act there.
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or

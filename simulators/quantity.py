@@ -11,7 +11,8 @@ from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, 
 
 PRIORS = ("uniform", "normal", "lognormal")
 TIMES = ("delay", "lag")  # of an input
-LIMITS = ("limits",)  # of a state
+LIMITS = ("limits", "role")  # of a state
+ROLES = ("position", "velocity", "level", "temperature", "other")  # of a state, that a user may declare
 
 
 class ModelError(ValueError):
@@ -23,7 +24,8 @@ class Quantity(NamedTuple):
 
     `prior` matters for parameters only. For `normal` (`lognormal`: of the logarithm) the range is the interval of +-2
     standard deviations, mean = (low + high)/2 and sd = (high - low)/4, and nothing is cut off at its ends.
-    An empty `unit` means that none was stated. Outputs have no range: low = high = nan.
+    An empty `unit` means that none was stated. Outputs have no range: low = high = nan. `role` says what a state is, one of
+    `ROLES`; empty: nothing was said, see `simulators.effects.structure`.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Quantity(NamedTuple):
     high: float
     periodic: bool = False
     prior: str = "uniform"
+    role: str = ""
 
     @property
     def middle(self) -> float:
@@ -162,7 +165,10 @@ def read_variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -
             f"{path}.unit: {node['unit']!r} is not allowed for a periodic state, whose sine and cosine are learned; use rad "
             "(convert the column of the measurements, too)"
         )
-    return Quantity(name, read_unit(path, node), *read_range(path, node), periodic=periodic)
+    role = node.get("role", "")
+    if "role" in node:
+        check_word(f"{path}.role", role, ROLES)
+    return Quantity(name, read_unit(path, node), *read_range(path, node), periodic=periodic, role=role)
 
 
 def read_times(
