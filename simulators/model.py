@@ -23,15 +23,14 @@ from simulators.quantity import (
     check_mapping,
     check_model_name,
     check_spelling,
-    read_expression,
     read_limits,
     read_number,
-    read_output,
     read_term,
     read_times,
     read_variable,
     refuse_unknown,
 )
+from simulators.sensors import read_sensors, with_lagging_readings
 from simulators.tables import read_tables
 
 __all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
@@ -101,6 +100,8 @@ class Model:
         delay: input: how much later it acts than it is recorded, s, or the parameter that says so.
         lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
+        saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
+            is not, as what is measured of it is.
         coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
@@ -120,6 +121,7 @@ class Model:
     delay: dict[str, float | str] = field(default_factory=dict)
     lag: dict[str, float | str] = field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
 
@@ -193,7 +195,9 @@ class Declared:
         tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
             intermediates, whose value is looked up (see `simulators.tables`).
         dynamics: state: expression of its time derivative, in all these names.
-        outputs: name: expression, or {unit, expression}; a measured quantity that is not a state.
+        outputs: name: expression, or {unit, expression, scale, bias, saturates: [low, high], lag, range}; a measured quantity
+            that is not a state. The reading is scale*expression + bias within `saturates` (null: no end); with `lag` (s) it
+            follows as a first-order lag does, and is a state of the model by this name, with this `range`.
         gap: state or output: expected model error of one transition, in its unit.
 
     Example:
@@ -231,8 +235,7 @@ class Declared:
         self._check_names()
         states = tuple(read_variable(f"sim.states.{name}", name, node, LIMITS) for name, node in self.states.items())
         inputs = tuple(read_variable(f"sim.inputs.{name}", name, node, TIMES) for name, node in self.inputs.items())
-        outputs = tuple(read_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
-        if not states and not outputs:
+        if not states and not self.outputs:
             raise ModelError(
                 "sim.states: neither states nor outputs: declare a state, or an output of a static function"
             )
@@ -241,7 +244,9 @@ class Declared:
         sections = (self.states, self.inputs, self.parameters, self.intermediates, self.tables)
         tables = read_tables(self.tables, (name for section in sections for name in section))
         defined = in_order(read_intermediates(self.intermediates) | tables, "write one of them without the others")
-        measured = {name: read_expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
+        least = {q.name: q.low for q in params} | fixed
+        sensors = read_sensors(self.outputs, self.parameters, least, dt / self.substeps)
+        lags = {name: sensor.lag for name, sensor in sensors.items() if sensor.lag is not None}
 
         def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
             scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
@@ -253,7 +258,10 @@ class Declared:
             return evaluated(defined, known(x, u, p))
 
         def outputs_of(scope: dict[str, Symbol]) -> list[Symbol]:
-            return [read_term(f"sim.outputs.{name}", formula, scope) for name, formula in measured.items()]
+            return [sensor.target(scope) for sensor in sensors.values()]
+
+        def time_constant(lag: float | str) -> Callable[[Symbol, Symbol, Symbol], Symbol]:
+            return lambda x, u, p: known(x, u, p)[lag] if isinstance(lag, str) else lag
 
         model = Model(
             name=self.name,
@@ -262,7 +270,7 @@ class Declared:
             states=states,
             inputs=inputs,
             params=params,
-            outputs=outputs,
+            outputs=tuple(sensor.quantity for sensor in sensors.values()),
             rhs=lambda x, u, p: column(self.symbol, self.rates(whole(x, u, p))),
             output=lambda x, u, p: column(self.symbol, outputs_of(whole(x, u, p))),
             gap=self._gap(),
@@ -272,6 +280,7 @@ class Declared:
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },
+            saturation={name: sensor.ends for name, sensor in sensors.items() if sensor.saturates},
             coordinates=self.own_coordinates(known),
             symbol=self.symbol,
         )
@@ -280,6 +289,7 @@ class Declared:
                 f"sim.states.{next(iter(model.limits))}.limits: {type(self).__name__} is not integrated in its states, so that "
                 "nothing could be put back; leave limits out"
             )
+        model = with_lagging_readings(model, {name: time_constant(lag) for name, lag in lags.items()})
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
 

@@ -13,6 +13,7 @@ PRIORS = ("uniform", "normal", "lognormal")
 TIMES = ("delay", "lag")  # of an input
 LIMITS = ("limits", "role")  # of a state
 ROLES = ("position", "velocity", "level", "temperature", "other")  # of a state, that a user may declare
+READING = "reading"  # role of a state that is the lagging reading of a sensor; simpel gives it
 
 
 class ModelError(ValueError):
@@ -138,19 +139,19 @@ def read_range(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
     return low, high
 
 
-def read_limits(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
-    """Read the limits of a state; null is none."""
-    ends = node["limits"]
+def read_limits(path: str, node: Mapping[str, Any], key: str = "limits") -> tuple[float, float]:
+    """Read the limits of a state, or of a sensor; null is none."""
+    ends = node[key]
     if not isinstance(ends, (list, tuple)) or len(ends) != 2:
-        raise ModelError(f"{path}.limits: {ends!r} is not allowed; write [low, high], null for no limit")
+        raise ModelError(f"{path}.{key}: {ends!r} is not allowed; write [low, high], null for no limit")
     if node.get("periodic"):
         raise ModelError(f"{path}.limits: a periodic state has no ends; leave limits out")
     low, high = (
-        infinite if end is None else read_number(f"{path}.limits", end)
+        infinite if end is None else read_number(f"{path}.{key}", end)
         for end, infinite in zip(ends, (-math.inf, math.inf), strict=True)
     )
     if low >= high:
-        raise ModelError(f"{path}.limits: low = {low:g} is not below high = {high:g}; swap or widen them")
+        raise ModelError(f"{path}.{key}: low = {low:g} is not below high = {high:g}; swap or widen them")
     return low, high
 
 
@@ -201,17 +202,8 @@ def read_uncertain(path: str, name: str, node: Mapping[str, Any]) -> Quantity:
     return Quantity(name, read_unit(path, node), low, high, prior=prior)
 
 
-def read_output(path: str, name: str, node: Any) -> Quantity:
-    """Read the name and unit of an output."""
-    unit = ""
-    if isinstance(node, Mapping):
-        check_keys(path, node, ("unit", "expression"))
-        unit = read_unit(path, node)
-    return Quantity(name, unit, math.nan, math.nan)
-
-
 def read_expression(path: str, node: Any) -> Any:
-    """Read the formula of an output."""
+    """Read the formula of an output or an intermediate."""
     if not isinstance(node, Mapping):
         return node
     if "expression" not in node:

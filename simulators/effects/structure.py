@@ -6,9 +6,9 @@ import casadi
 import numpy as np
 
 from simulators.model import Model
+from simulators.quantity import READING
 
 VELOCITIES = ("m/s", "rad/s", "deg/s", "1/min", "rpm")  # units that nothing else than a velocity has
-SENSOR = "sensor"  # role of a state that is the lagging reading of an output; simpel gives it
 _FIRST_ORDER = ("level", "temperature", "other")
 
 
@@ -44,11 +44,11 @@ def structure(model: Model) -> Structure:
     identity = _identities(model)
     kinematic: dict[int, int | None] = {}
     for i, q in enumerate(model.states):
-        declared = q.role in ("position", SENSOR)
+        declared = q.role in ("position", READING)
         if q.role and not declared:
             continue
         source = None
-        if q.role != SENSOR and not on_p[i].any() and not on_u[i].any():
+        if q.role != READING and not on_p[i].any() and not on_u[i].any():
             others = [j for j in np.flatnonzero(on_x[i]) if j != i and units[j]]
             of_rate = [int(j) for j in others if units[j] == _plain(f"{units[i]}/s")]
             source = of_rate[0] if of_rate else identity.get(i)
