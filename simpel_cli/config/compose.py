@@ -18,6 +18,7 @@ from simpel_cli.config.group_classes import SIMULATORS
 from simpel_cli.config.groups import BROUGHT, CONTROL, group_folder, keys_of_other_verbs, top_level, user_conf
 from simpel_cli.config.hydra_errors import translated, unknown_root
 from simpel_cli.config.overrides import checked, swept_keys, value_of
+from simpel_cli.config.places import Layer, layers_of, with_place
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import refuse_occupied
 from simulators.quantity import ModelError
@@ -106,8 +107,12 @@ def launch(
                 )
             )
         except Exception as error:
+            with contextlib.suppress(Exception):  # where the key stands is no reason to lose what is wrong with it
+                layers.extend(layers_of(verb, HydraConfig.get().overrides.task, folders))
             raise _Stopped from error
 
+    layers: list[Layer] = []
+    folders = [*([user] if user else []), conf_dir()]
     failure: BaseException | None = None
     before, sys.argv = sys.argv, [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us as exceptions, not as Hydra's printout
@@ -115,13 +120,13 @@ def launch(
         with _mode_of_flags() if value_of("hydra.mode", overrides) is None else contextlib.nullcontext():
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(entry)()
     except _Stopped as stopped:
-        failure = translated(stopped.__cause__, verb, known, [*([user] if user else []), conf_dir()], own=False)
+        failure = translated(stopped.__cause__, verb, known, folders, own=False)
     except Exception as error:
-        failure = translated(error, verb, known, [*([user] if user else []), conf_dir()], own=True)
+        failure = translated(error, verb, known, folders, own=True)
     finally:
         sys.argv = before
     if failure is not None:  # raised here, so that no traceback shows our detour
-        raise failure
+        raise with_place(failure, layers, overrides)
 
 
 def _read_tables(config: dict[str, Any], choices: Mapping[str, Any], user: Path | None) -> None:

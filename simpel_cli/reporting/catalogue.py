@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from simpel_cli.config.groups import options
+from simpel_cli.config.places import Layer, with_place
 from simpel_cli.config.resolved import load
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
 from simpel_cli.reporting.equations import equations, roles_of, tables
@@ -91,8 +92,8 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     try:
         node = with_files_read(entry.node, [entry.path.parent, Path.cwd()])
         model = build(node, "sim", plugins).model()
-    except ModelError as error:
-        raise ConfigError(f"{entry.path}: {error}") from error
+    except (ModelError, ConfigError) as error:
+        raise with_place(ConfigError(str(error)), [Layer(entry.path, ("sim",))]) from error
     terminal.line(entry.comment)
     terminal.line(str(entry.path), "file")
     terminal.line(f"{model.dt:g} s per transition, {getattr(model, 'substeps', 1)} substeps", "step")
