@@ -3,10 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from simulators.expression import ExpressionError, Symbol, symbols_used
 from simulators.model import Declared, ModelError
 from simulators.quantity import refuse_unknown
+from simulators.sections import SECTIONS
 
 FIDELITIES = ("low", "high")
 SENSOR = ("scale", "bias", "lag")  # keys of an output that may name a parameter
@@ -28,6 +30,8 @@ class Built(Declared, ABC):
     @abstractmethod
     def rates(self, known: Mapping[str, Symbol]) -> list[Symbol]:
         """Return d(state)/dt in the order of the states, from what every name stands for."""
+
+    sections: ClassVar[dict[str, Any]] = SECTIONS | {"dynamics": {"type": "object", "maxProperties": 0}}
 
     def _check_dynamics(self) -> None:
         kind = type(self).__name__

@@ -19,6 +19,9 @@ from simulators.quantity import (
     refuse_unknown,
 )
 
+INTERMEDIATE = ("unit", "expression")
+KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior")  # of a parameter
+
 
 class Definition(NamedTuple):
     """A name that stands for an expression of other names.
@@ -80,7 +83,7 @@ def read_intermediates(nodes: Mapping[str, Any]) -> dict[str, Definition]:
     for name, node in nodes.items():
         path = f"sim.intermediates.{name}"
         if isinstance(node, Mapping):
-            check_keys(path, node, ("unit", "expression"))
+            check_keys(path, node, INTERMEDIATE)
             read_unit(path, node)
         found[name] = expression_of(path, read_expression(path, node))
     return found
@@ -101,11 +104,11 @@ def read_parameters(
         elif not isinstance(node, Mapping):
             fixed[name] = read_number(path, node)
         elif "value" in node:
-            check_keys(path, node, ("unit", "value"), "a known parameter takes no range")
+            check_keys(path, node, KNOWN, "a known parameter takes no range")
             read_unit(path, node)
             fixed[name] = read_number(f"{path}.value", node["value"])
         else:
-            check_keys(path, node, ("unit", "range", "prior"), "`value: <number>` in place of a range makes it known")
+            check_keys(path, node, UNCERTAIN, "`value: <number>` in place of a range makes it known")
             uncertain.append(read_uncertain(path, name, node))
     derived: dict[str, Definition] = {}
     for name, definition in in_order(formulas, "give one of them a number or a range").items():

@@ -3,8 +3,9 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
+from simulators.definitions import UNCERTAIN
 from simulators.expression import Symbol
 from simulators.model import Model, ModelError, column
 from simulators.quantity import (
@@ -20,6 +21,9 @@ from simulators.quantity import (
     read_uncertain,
     refuse_unknown,
 )
+from simulators.sections import NUMBER, SECTIONS, either, keys, named
+
+INPUT = ("value", *TIMES)
 
 
 class Base(Protocol):
@@ -55,6 +59,12 @@ class Extended:
     inputs: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
 
+    sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields
+        "parameters": named(either(NUMBER, keys(UNCERTAIN, ("range",)))),
+        "inputs": named(keys(INPUT)),
+        "dynamics": SECTIONS["dynamics"],
+    }
+
     def model(self) -> Model:
         """Check everything and build the model."""
         check_model_name(self.name)
@@ -83,7 +93,7 @@ class Extended:
         _known("inputs", self.inputs, base.inputs)
         _known("dynamics", self.dynamics, base.states)
         for name, node in self.inputs.items():
-            check_keys(f"sim.inputs.{name}", node, ("value", *TIMES))
+            check_keys(f"sim.inputs.{name}", node, INPUT)
         params = (*base.params, *own)
         values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
 

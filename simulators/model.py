@@ -30,6 +30,7 @@ from simulators.quantity import (
     read_variable,
     refuse_unknown,
 )
+from simulators.sections import SECTIONS
 from simulators.sensors import read_sensors, with_lagging_readings
 from simulators.tables import read_tables
 
@@ -218,6 +219,7 @@ class Declared:
     gap: dict[str, Any] = field(default_factory=dict)
 
     symbol: ClassVar[Any] = casadi.SX
+    sections: ClassVar[dict[str, Any]] = SECTIONS  # JSON schemas of fields
 
     def model(self) -> Model:
         """Check everything and build the model.

@@ -10,6 +10,7 @@ import casadi
 from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, did_you_mean, parse
 
 PRIORS = ("uniform", "normal", "lognormal")
+VARIABLE = ("unit", "range", "periodic")  # of a state or an input
 TIMES = ("delay", "lag")  # of an input
 LIMITS = ("limits", "role")  # of a state
 ROLES = ("position", "velocity", "level", "temperature", "other")  # of a state, that a user may declare
@@ -157,7 +158,7 @@ def read_limits(path: str, node: Mapping[str, Any], key: str = "limits") -> tupl
 
 def read_variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -> Quantity:
     """Read a state or an input."""
-    check_keys(path, node, ("unit", "range", "periodic", *more))
+    check_keys(path, node, (*VARIABLE, *more))
     periodic = node.get("periodic", False)
     if not isinstance(periodic, bool):
         raise ModelError(f"{path}.periodic: {periodic!r} is not allowed; write true or false")

@@ -184,7 +184,7 @@ def _comment(path: Path) -> str:
     for line in path.read_text().splitlines():
         if not line.startswith("#"):
             break
-        if "@package" not in line:
+        if "@package" not in line and "yaml-language-server" not in line:
             lines.append(line.lstrip("# ").rstrip())
     return " ".join(filter(None, lines))
 

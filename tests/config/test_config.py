@@ -107,11 +107,11 @@ OWN_TO_THE_SYSTEM = {"Declared", "MujocoWorld", "CallableWorld", "Measurements"}
 )
 def test_leaves_list_every_field(path: Path) -> None:
     """What can be set stands in the YAML with its value: users read it there."""
-    from simpel_cli.config.build import _resolve
+    from simpel_cli.config.build import resolve
 
     def check(node: Mapping, where: str) -> None:
         if "_target_" in node:
-            cls = _resolve(node["_target_"], where, ())
+            cls = resolve(node["_target_"], where, ())
             names = {f.name for f in dataclasses.fields(cls)}
             written = set(node) - {"_target_", "defaults"}
             assert written <= names
