@@ -63,7 +63,8 @@ def _reading(name: str, node: Any) -> str:
     """Return what is read: scale*(expression) + bias, its ends and its lag."""
     own = node if isinstance(node, Mapping) else {}
     text = _expression(node)
-    text = f"{own['scale']}*({text})" if "scale" in own else text
+    if "scale" in own:
+        text = f"{own['scale']}*{text if text.isidentifier() else f'({text})'}"
     bias = str(own.get("bias", 0))
     text = f"{text} - {bias[1:]}" if bias.startswith("-") else text if bias == "0" else f"{text} + {bias}"
     extra = []

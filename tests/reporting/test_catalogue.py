@@ -109,7 +109,7 @@ def test_intermediates_tables_roles_and_sensors_are_shown(tmp_path: Path) -> Non
         "net = torque - 0.01*n",
         "torque = table of n, u [N m]",
         "dn/dt = net/J",
-        "volts = gain*(w) - 1 [V] (saturates at 0 and no end)",
+        "volts = gain*w - 1 [V] (saturates at 0 and no end)",
         "tacho = n [1/min] (follows with a lag of 0.2 s)",
     ):
         assert line in lines, result.out
