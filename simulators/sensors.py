@@ -101,7 +101,8 @@ def with_lagging_readings(model: Any, lags: Mapping[str, Any]) -> Any:
         return casadi.vertcat(model.rhs(own, u, p), *follow(own, x[size:], u, p))
 
     def output(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
-        return model.output(x[:size], u, p)[prompt]
+        readings = model.output(x[:size], u, p)
+        return readings[prompt] if prompt else model.symbol(0, 1)
 
     coordinates = own = model.coordinates
     if own is not None:

@@ -89,6 +89,11 @@ def test_of_a_static_function() -> None:
     model = Declared("static", 0.1, inputs={"u": {"range": [0, 1]}}, outputs=outputs).model()
     rates, prompt = model.function()(0.25, 1, [])
     assert (float(rates), float(prompt)) == (pytest.approx(0.75 / 0.2), 2)
+    del outputs["z"]
+    assert Declared("static", 0.1, inputs={"u": {"range": [0, 1]}}, outputs=outputs).model().function().size_out(1) == (
+        0,
+        1,
+    )
 
 
 def test_beside_coordinates_of_its_own() -> None:
