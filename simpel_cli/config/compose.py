@@ -36,6 +36,7 @@ class Job(typing.NamedTuple):
     verb: str = "fit"
     sweep: Path | None = None  # directory of the sweep that it is a job of
     launcher: dict[str, Any] = {}  # noqa: RUF012  options of the sweep's launcher
+    layers: tuple[Layer, ...] = ()  # of a sweep's job: the YAML files that it is composed of
 
 
 class _Stopped(BaseException):
@@ -104,14 +105,24 @@ def launch(
                     "fit" if verb == "sweep" else verb,
                     sweep,
                     launching or {},
+                    composed() if sweep else (),
                 )
             )
         except Exception as error:
-            with contextlib.suppress(Exception):  # where the key stands is no reason to lose what is wrong with it
-                layers.extend(layers_of(verb, HydraConfig.get().overrides.task, folders))
+            layers.extend(composed())
             raise _Stopped from error
 
+    def composed() -> tuple[Layer, ...]:
+        with contextlib.suppress(Exception):  # where a key stands is no reason to lose what is wrong with it
+            hydra_config = HydraConfig.get()
+            choices = str(hydra_config.runtime.choices)
+            if choices not in files:  # jobs of a sweep differ in numbers mostly, seldom in files
+                files[choices] = tuple(layers_of(verb, hydra_config.overrides.task, folders))
+            return files[choices]
+        return ()
+
     layers: list[Layer] = []
+    files: dict[str, tuple[Layer, ...]] = {}
     folders = [*([user] if user else []), conf_dir()]
     failure: BaseException | None = None
     before, sys.argv = sys.argv, [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]

@@ -11,7 +11,16 @@ from simulators.table_files import READ_FROM
 
 
 def equations(sim: Mapping[str, Any]) -> list[str]:
-    """Return `name = expression` of derived parameters, intermediates, tables, rates and readings."""
+    """Return `name = expression` of derived parameters, intermediates, tables, rates and readings.
+
+    Where terms are added to another simulator (`simulators.extended`), its equations come first.
+    """
+    base = sim.get("base")
+    if isinstance(base, Mapping):
+        lines = equations(base)
+        inputs = {k: v for k, v in (sim.get("inputs") or {}).items() if isinstance(v, Mapping) and "value" in v}
+        lines += [f"{name} acts as {node['value']}" for name, node in inputs.items()]
+        return lines + [f"d{name}/dt = rate_{name} + {term}" for name, term in (sim.get("dynamics") or {}).items()]
     parameters = sim.get("parameters") or {}
     lines = [f"{name} = {node}" for name, node in parameters.items() if isinstance(node, str)]
     lines += [f"{name} = {_expression(node)}{_unit(node)}" for name, node in (sim.get("intermediates") or {}).items()]
@@ -23,7 +32,8 @@ def equations(sim: Mapping[str, Any]) -> list[str]:
 
 def tables(sim: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a row for each table: name, unit, inputs, method, nodes, values, file."""
-    rows: list[tuple[str, ...]] = []
+    base = sim.get("base")
+    rows: list[tuple[str, ...]] = tables(base) if isinstance(base, Mapping) else []
     for name, node in (sim.get("tables") or {}).items():
         nodes = " x ".join(str(len(axis)) for axis in node["axes"])
         values = [float(value) for row in node["values"] for value in (row if isinstance(row, list | tuple) else [row])]

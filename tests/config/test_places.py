@@ -58,6 +58,13 @@ def test_of_a_group_under_another_name(folder: Path) -> None:
     assert result.err.endswith(" (conf/sim/pend.yaml, line 2)\n")
 
 
+def test_of_the_jobs_of_a_sweep(folder: Path) -> None:
+    result = simpel(folder, "sweep", *FIT[1:], "sim=light,cart", "data.n_train=-1", "hydra.sweep.dir=sweep")
+    assert result.code == 2
+    assert "swap them (conf/sim/light.yaml, line 4); 1: data.n_train: -1 is not allowed" in result.err
+    assert result.err.endswith("only a whole number of at least 0.\n")  # that was given on the command line
+
+
 def test_an_expression_keeps_its_caret(folder: Path) -> None:
     (folder / "conf" / "sim" / "cart.yaml").write_text(CART.replace("s: v\n", "s: v + q\n"))
     for words in ((*FIT, "sim=cart"), ("sims", "cart", "--config-dir", "conf")):

@@ -113,6 +113,12 @@ def test_intermediates_tables_roles_and_sensors_are_shown(tmp_path: Path) -> Non
         "tacho = n [1/min] (follows with a lag of 0.2 s)",
     ):
         assert line in lines, result.out
+    more = "_target_: simulators.extended.Extended\nname: more\ndynamics: {n: -0.1*n}\nbase:\n"
+    base = "".join(f"  {line}\n" for line in MOTOR.splitlines())
+    (tmp_path / "conf" / "sim" / "more.yaml").write_text(more + base)
+    shown = simpel(tmp_path, "sims", "more", "--config-dir", "conf").out
+    for line in ("dn/dt = net/J", "dn/dt = rate_n + -0.1*n", "2 x 2"):
+        assert line in shown
     shown = simpel(tmp_path, "sims", "pendulum").out
     assert "velocity (inferred: unit rad/s)" in shown
     assert "angle, position (inferred: its rate is omega)" in shown
