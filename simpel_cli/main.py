@@ -17,6 +17,7 @@ from simpel_cli.commands.fit import fit
 from simpel_cli.commands.report import report
 from simpel_cli.commands.rl_offline import rl_offline
 from simpel_cli.commands.rl_online import rl_online
+from simpel_cli.commands.schema import schema
 from simpel_cli.commands.sims import sims
 from simpel_cli.commands.simulate import simulate
 from simpel_cli.commands.sweep import sweep
@@ -54,6 +55,7 @@ def _simpel(
 
 for verb in (
     fit, evaluate, discover, rl_offline, rl_online, sweep, report, export, sims, effects, example, doctor, simulate,
+    schema,
 ):  # fmt: skip
     app.command(verb.__name__.replace("_", "-"))(verb)
 

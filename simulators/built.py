@@ -3,12 +3,15 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from simulators.expression import ExpressionError, Symbol, symbols_used
 from simulators.model import Declared, ModelError
 from simulators.quantity import refuse_unknown
+from simulators.sections import SECTIONS
 
 FIDELITIES = ("low", "high")
+SENSOR = ("scale", "bias", "lag")  # keys of an output that may name a parameter
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class Built(Declared, ABC):
     def rates(self, known: Mapping[str, Symbol]) -> list[Symbol]:
         """Return d(state)/dt in the order of the states, from what every name stands for."""
 
+    sections: ClassVar[dict[str, Any]] = SECTIONS | {"dynamics": {"type": "object", "maxProperties": 0}}
+
     def _check_dynamics(self) -> None:
         kind = type(self).__name__
         if self.dynamics:
@@ -46,9 +51,14 @@ class Built(Declared, ABC):
                 refuse_unknown(f"sim.{section}.{spare[0]}", f"the equations of {kind} do not use it", spare[0], names)
 
     def _used(self) -> set[str]:
-        """Return the names that derived parameters, delays and lags refer to."""
+        """Return the names that derived parameters, intermediates, tables, outputs, delays and lags refer to, and sensors."""
+        named = [*self.intermediates.values(), *self.outputs.values()]
         formulas = [node for node in self.parameters.values() if isinstance(node, str)]
+        formulas += [str(node.get("expression", "") if isinstance(node, dict) else node) for node in named]
+        formulas += [str(name) for node in self.tables.values() for name in dict(node).get("inputs", ())]
         times = [node.get(key) for node in self.inputs.values() for key in ("delay", "lag") if isinstance(node, dict)]
+        numbers = [node.get(key) for node in self.outputs.values() for key in SENSOR if isinstance(node, dict)]
+        times += [number for number in numbers if isinstance(number, str)]
         return {name for formula in formulas for name in symbols_in(formula)} | {t for t in times if isinstance(t, str)}
 
 

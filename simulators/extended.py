@@ -1,12 +1,15 @@
 """A simulator with terms added to it: what `simpel discover` writes where the equations are in Python, not in YAML."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
+from simulators.definitions import UNCERTAIN
 from simulators.expression import Symbol
 from simulators.model import Model, ModelError, column
 from simulators.quantity import (
+    GIVEN,
     TIMES,
     Quantity,
     check_free,
@@ -20,6 +23,9 @@ from simulators.quantity import (
     read_uncertain,
     refuse_unknown,
 )
+from simulators.sections import NUMBER, SECTIONS, either, keys, named
+
+INPUT = ("value", *GIVEN)
 
 
 class Base(Protocol):
@@ -55,10 +61,19 @@ class Extended:
     inputs: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
 
+    sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields
+        "parameters": named(either(NUMBER, keys(UNCERTAIN, ("range",)))),
+        "inputs": named(keys(INPUT)),
+        "dynamics": SECTIONS["dynamics"],
+    }
+
     def model(self) -> Model:
         """Check everything and build the model."""
         check_model_name(self.name)
-        base = self.base.model()
+        try:
+            base = self.base.model()
+        except ModelError as error:
+            raise ModelError(re.sub(r"^sim\.", "sim.base.", str(error))) from None
         if not isinstance(base, Model):
             raise ModelError(
                 "sim.base: a world shows no equations that terms could be added to; give a simulator in symbols"
@@ -80,7 +95,7 @@ class Extended:
         _known("inputs", self.inputs, base.inputs)
         _known("dynamics", self.dynamics, base.states)
         for name, node in self.inputs.items():
-            check_keys(f"sim.inputs.{name}", node, ("value", *TIMES, "between_rows"))
+            check_keys(f"sim.inputs.{name}", node, INPUT)
         params = (*base.params, *own)
         values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
 

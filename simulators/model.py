@@ -8,34 +8,32 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from graphlib import CycleError, TopologicalSorter
 from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.expression import ExpressionError, Symbol, symbols_used
+from simulators.definitions import evaluated, in_order, read_intermediates, read_parameters
+from simulators.expression import Symbol
 from simulators.quantity import (
+    GIVEN,
     LIMITS,
-    TIMES,
     ModelError,
     Quantity,
     check_free,
-    check_keys,
     check_mapping,
     check_model_name,
     check_spelling,
     read_between_rows,
-    read_expression,
     read_limits,
     read_number,
-    read_output,
     read_term,
     read_times,
-    read_uncertain,
-    read_unit,
     read_variable,
     refuse_unknown,
 )
+from simulators.sections import SECTIONS
+from simulators.sensors import read_sensors, with_lagging_readings
+from simulators.tables import read_tables
 
 __all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
 
@@ -106,6 +104,8 @@ class Model:
         between_rows: input: `held` over a transition at the value of its row, or `linear`, straight to the value of the next
             row. Held where nothing is said.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
+        saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
+            is not, as what is measured of it is.
         coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
@@ -126,6 +126,7 @@ class Model:
     lag: dict[str, float | str] = field(default_factory=dict)
     between_rows: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
 
@@ -193,14 +194,21 @@ class Declared:
         name: letters, digits and single underscores.
         dt: duration of one transition, s.
         substeps: RK4 steps per transition.
-        states: name: {unit, range: [low, high], periodic: false, limits: [low, high]}; none for a static function. What
+        states: name: {unit, range: [low, high], periodic: false, limits: [low, high], role}; none for a static function. What
             leaves the `limits` is put back after each Runge-Kutta step (null: no limit), e.g. a level that cannot be negative.
+            `role`: position, velocity, level, temperature or other; says which effects can act there.
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
-        dynamics: state: expression of its time derivative, in states, inputs and parameters.
-        outputs: name: expression, or {unit, expression}; a measured quantity that is not a state.
+        intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
+            in any order; a name that dynamics and outputs can use.
+        tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
+            intermediates, whose value is looked up (see `simulators.tables`).
+        dynamics: state: expression of its time derivative, in all these names.
+        outputs: name: expression, or {unit, expression, scale, bias, saturates: [low, high], lag, range}; a measured quantity
+            that is not a state. The reading is scale*expression + bias within `saturates` (null: no end); with `lag` (s) it
+            follows as a first-order lag does, and is a state of the model by this name, with this `range`.
         gap: state or output: expected model error of one transition, in its unit.
 
     Example:
@@ -214,11 +222,14 @@ class Declared:
     states: dict[str, Any] = field(default_factory=dict)
     inputs: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
+    intermediates: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
 
     symbol: ClassVar[Any] = casadi.SX
+    sections: ClassVar[dict[str, Any]] = SECTIONS  # JSON schemas of fields
 
     def model(self) -> Model:
         """Check everything and build the model.
@@ -235,29 +246,34 @@ class Declared:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
         states = tuple(read_variable(f"sim.states.{name}", name, node, LIMITS) for name, node in self.states.items())
-        inputs = tuple(
-            read_variable(f"sim.inputs.{name}", name, node, (*TIMES, "between_rows"))
-            for name, node in self.inputs.items()
-        )
-        outputs = tuple(read_output(f"sim.outputs.{name}", name, node) for name, node in self.outputs.items())
-        if not states and not outputs:
+        inputs = tuple(read_variable(f"sim.inputs.{name}", name, node, GIVEN) for name, node in self.inputs.items())
+        if not states and not self.outputs:
             raise ModelError(
                 "sim.states: neither states nor outputs: declare a state, or an output of a static function"
             )
         self._check_dynamics()
-        params, fixed, derived = self._parameters()
-        measured = {name: read_expression(f"sim.outputs.{name}", node) for name, node in self.outputs.items()}
+        params, fixed, derived = read_parameters(self.parameters)
+        sections = (self.states, self.inputs, self.parameters, self.intermediates, self.tables)
+        tables = read_tables(self.tables, (name for section in sections for name in section))
+        defined = in_order(read_intermediates(self.intermediates) | tables, "write one of them without the others")
+        least = {q.name: q.low for q in params} | fixed
+        sensors = read_sensors(self.outputs, self.parameters, least, dt / self.substeps)
+        lags = {name: sensor.lag for name, sensor in sensors.items() if sensor.lag is not None}
 
         def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
             scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
             for group, column in ((states, x), (inputs, u), (params, p)):
                 scope |= {quantity.name: column[row] for row, quantity in enumerate(group)}
-            for name, formula in derived.items():
-                scope[name] = read_term(f"sim.parameters.{name}", formula, scope)
-            return scope
+            return evaluated(derived, scope)
+
+        def whole(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            return evaluated(defined, known(x, u, p))
 
         def outputs_of(scope: dict[str, Symbol]) -> list[Symbol]:
-            return [read_term(f"sim.outputs.{name}", formula, scope) for name, formula in measured.items()]
+            return [sensor.target(scope) for sensor in sensors.values()]
+
+        def time_constant(lag: float | str) -> Callable[[Symbol, Symbol, Symbol], Symbol]:
+            return lambda x, u, p: known(x, u, p)[lag] if isinstance(lag, str) else lag
 
         model = Model(
             name=self.name,
@@ -266,9 +282,9 @@ class Declared:
             states=states,
             inputs=inputs,
             params=params,
-            outputs=outputs,
-            rhs=lambda x, u, p: column(self.symbol, self.rates(known(x, u, p))),
-            output=lambda x, u, p: column(self.symbol, outputs_of(known(x, u, p))),
+            outputs=tuple(sensor.quantity for sensor in sensors.values()),
+            rhs=lambda x, u, p: column(self.symbol, self.rates(whole(x, u, p))),
+            output=lambda x, u, p: column(self.symbol, outputs_of(whole(x, u, p))),
             gap=self._gap(),
             fixed=fixed,
             delay=read_times("delay", self.inputs, params, fixed),
@@ -277,6 +293,7 @@ class Declared:
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },
+            saturation={name: sensor.ends for name, sensor in sensors.items() if sensor.saturates},
             coordinates=self.own_coordinates(known),
             symbol=self.symbol,
         )
@@ -285,6 +302,7 @@ class Declared:
                 f"sim.states.{next(iter(model.limits))}.limits: {type(self).__name__} is not integrated in its states, so that "
                 "nothing could be put back; leave limits out"
             )
+        model = with_lagging_readings(model, {name: time_constant(lag) for name, lag in lags.items()})
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
 
@@ -298,7 +316,7 @@ class Declared:
 
     def _check_names(self) -> None:
         taken: dict[str, str] = {}
-        for section in ("states", "inputs", "parameters", "outputs", "dynamics", "gap"):
+        for section in ("states", "inputs", "parameters", "intermediates", "tables", "outputs", "dynamics", "gap"):
             path, node = f"sim.{section}", getattr(self, section)
             check_mapping(path, node)
             for name in node:
@@ -334,54 +352,6 @@ class Declared:
             if gap[name] < 0:
                 raise ModelError(f"sim.gap.{name}: {gap[name]:g} is negative; give a standard deviation, 0 for none")
         return gap
-
-    def _parameters(self) -> tuple[tuple[Quantity, ...], dict[str, float], dict[str, str]]:
-        """Return the uncertain ones, the known numbers, and the derived expressions in an order of evaluation."""
-        uncertain: list[Quantity] = []
-        fixed: dict[str, float] = {}
-        formulas: dict[str, str] = {}
-        for name, node in self.parameters.items():
-            path = f"sim.parameters.{name}"
-            if isinstance(node, str):
-                formulas[name] = node
-            elif not isinstance(node, Mapping):
-                fixed[name] = read_number(path, node)
-            elif "value" in node:
-                check_keys(path, node, ("unit", "value"), "a known parameter takes no range")
-                read_unit(path, node)
-                fixed[name] = read_number(f"{path}.value", node["value"])
-            else:
-                check_keys(
-                    path, node, ("unit", "range", "prior"), "`value: <number>` in place of a range makes it known"
-                )
-                uncertain.append(read_uncertain(path, name, node))
-        derived: dict[str, str] = {}
-        for name in self._order(formulas):
-            if symbols_used(formulas[name]) <= fixed.keys():
-                scope = {other: casadi.SX(value) for other, value in fixed.items()}
-                fixed[name] = float(read_term(f"sim.parameters.{name}", formulas[name], scope))
-            else:
-                derived[name] = formulas[name]
-        return tuple(uncertain), fixed, derived
-
-    def _order(self, formulas: Mapping[str, str]) -> list[str]:
-        uses: dict[str, set[str]] = {}
-        for name, formula in formulas.items():
-            path = f"sim.parameters.{name}"
-            try:
-                uses[name] = symbols_used(formula)
-            except ExpressionError as error:
-                raise ModelError(f"{path}: {error}") from None
-            for other in sorted(uses[name] - self.parameters.keys()):
-                refuse_unknown(path, f"uses {other}, which is no parameter", other, self.parameters)
-        try:
-            order = list(TopologicalSorter(uses).static_order())
-        except CycleError as error:
-            loop = " -> ".join(reversed(error.args[1]))
-            raise ModelError(
-                f"sim.parameters: derived in a circle, {loop}; give one of them a number or a range"
-            ) from None
-        return [name for name in order if name in formulas]
 
 
 def column(symbol: Any, rows: list[Symbol]) -> Symbol:

@@ -10,9 +10,13 @@ import casadi
 from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, did_you_mean, parse
 
 PRIORS = ("uniform", "normal", "lognormal")
+VARIABLE = ("unit", "range", "periodic")  # of a state or an input
 TIMES = ("delay", "lag")  # of an input
 BETWEEN_ROWS = ("held", "linear")  # what an input does from one row to the next
-LIMITS = ("limits",)  # of a state
+GIVEN = (*TIMES, "between_rows")  # of an input
+LIMITS = ("limits", "role")  # of a state
+ROLES = ("position", "velocity", "level", "temperature", "other")  # of a state, that a user may declare
+READING = "reading"  # role of a state that is the lagging reading of a sensor; simpel gives it
 
 
 class ModelError(ValueError):
@@ -24,7 +28,8 @@ class Quantity(NamedTuple):
 
     `prior` matters for parameters only. For `normal` (`lognormal`: of the logarithm) the range is the interval of +-2
     standard deviations, mean = (low + high)/2 and sd = (high - low)/4, and nothing is cut off at its ends.
-    An empty `unit` means that none was stated. Outputs have no range: low = high = nan.
+    An empty `unit` means that none was stated. Outputs have no range: low = high = nan. `role` says what a state is, one of
+    `ROLES`; empty: nothing was said, see `simulators.effects.structure`.
     """
 
     name: str
@@ -33,6 +38,7 @@ class Quantity(NamedTuple):
     high: float
     periodic: bool = False
     prior: str = "uniform"
+    role: str = ""
 
     @property
     def middle(self) -> float:
@@ -136,25 +142,25 @@ def read_range(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
     return low, high
 
 
-def read_limits(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
-    """Read the limits of a state; null is none."""
-    ends = node["limits"]
+def read_limits(path: str, node: Mapping[str, Any], key: str = "limits") -> tuple[float, float]:
+    """Read the limits of a state, or of a sensor; null is none."""
+    ends = node[key]
     if not isinstance(ends, (list, tuple)) or len(ends) != 2:
-        raise ModelError(f"{path}.limits: {ends!r} is not allowed; write [low, high], null for no limit")
+        raise ModelError(f"{path}.{key}: {ends!r} is not allowed; write [low, high], null for no limit")
     if node.get("periodic"):
         raise ModelError(f"{path}.limits: a periodic state has no ends; leave limits out")
     low, high = (
-        infinite if end is None else read_number(f"{path}.limits", end)
+        infinite if end is None else read_number(f"{path}.{key}", end)
         for end, infinite in zip(ends, (-math.inf, math.inf), strict=True)
     )
     if low >= high:
-        raise ModelError(f"{path}.limits: low = {low:g} is not below high = {high:g}; swap or widen them")
+        raise ModelError(f"{path}.{key}: low = {low:g} is not below high = {high:g}; swap or widen them")
     return low, high
 
 
 def read_variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -> Quantity:
     """Read a state or an input."""
-    check_keys(path, node, ("unit", "range", "periodic", *more))
+    check_keys(path, node, (*VARIABLE, *more))
     periodic = node.get("periodic", False)
     if not isinstance(periodic, bool):
         raise ModelError(f"{path}.periodic: {periodic!r} is not allowed; write true or false")
@@ -163,7 +169,10 @@ def read_variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -
             f"{path}.unit: {node['unit']!r} is not allowed for a periodic state, whose sine and cosine are learned; use rad "
             "(convert the column of the measurements, too)"
         )
-    return Quantity(name, read_unit(path, node), *read_range(path, node), periodic=periodic)
+    role = node.get("role", "")
+    if "role" in node:
+        check_word(f"{path}.role", role, ROLES)
+    return Quantity(name, read_unit(path, node), *read_range(path, node), periodic=periodic, role=role)
 
 
 def read_times(
@@ -206,17 +215,8 @@ def read_uncertain(path: str, name: str, node: Mapping[str, Any]) -> Quantity:
     return Quantity(name, read_unit(path, node), low, high, prior=prior)
 
 
-def read_output(path: str, name: str, node: Any) -> Quantity:
-    """Read the name and unit of an output."""
-    unit = ""
-    if isinstance(node, Mapping):
-        check_keys(path, node, ("unit", "expression"))
-        unit = read_unit(path, node)
-    return Quantity(name, unit, math.nan, math.nan)
-
-
 def read_expression(path: str, node: Any) -> Any:
-    """Read the formula of an output."""
+    """Read the formula of an output or an intermediate."""
     if not isinstance(node, Mapping):
         return node
     if "expression" not in node:

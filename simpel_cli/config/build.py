@@ -38,7 +38,7 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
         raise ConfigError(f"{path}: got {node!r}; expected a mapping of keys.")
     fields = {str(k): v for k, v in node.items() if k != "_target_"}
     target = node.get("_target_")
-    cls = _resolve(str(target), path, plugins) if target is not None else default or obvious_class(path)
+    cls = resolve(str(target), path, plugins) if target is not None else default or obvious_class(path)
     if cls is None:
         raise ConfigError(
             f"{path}: the key _target_ is missing; it names the class, as the options in conf/{path.partition('.')[0]}/ do."
@@ -72,7 +72,12 @@ def build_source(node: Any, path: str, plugins: tuple[str, ...] = ()) -> Any:
     try:
         return declared.model()
     except ValueError as error:  # simulators.model.ModelError
-        raise ConfigError(str(error)) from error
+        raise ConfigError(of_group(str(error), path)) from error
+
+
+def of_group(message: str, group: str) -> str:
+    """Return what a simulator says of `sim.KEY` with the name of the group that it is declared in."""
+    return f"{group}.{message.removeprefix('sim.')}" if message.startswith("sim.") else message
 
 
 def build_settings(config: Mapping[str, Any]) -> Any:
@@ -116,7 +121,12 @@ def _build_group(node: Any, name: str, plugins: tuple[str, ...]) -> Any:
     return build(node, name, plugins)
 
 
-def _resolve(target: str, path: str, plugins: tuple[str, ...]) -> type:
+def resolve(target: str, path: str, plugins: tuple[str, ...] = ()) -> type:
+    """Return the dataclass that a `_target_` names.
+
+    Raises:
+        ConfigError: it is none, or outside the fence.
+    """
     package = target.split(".")[0]
     if package not in (*OWN_PACKAGES, *plugins):
         raise ConfigError(
@@ -174,7 +184,7 @@ def _convert(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: 
         if converted is not _NO:
             return converted
     expected = " or ".join(_type_name(o) for o in options)
-    doc = _field_docs(owner).get(path.rpartition(".")[2], "")
+    doc = field_docs(owner).get(path.rpartition(".")[2], "")
     raise ConfigError(f"{path}: got {value!r}; expected {expected}{': ' + doc if doc else '.'}")
 
 
@@ -221,7 +231,7 @@ def _type_name(hint: Any) -> str:
     return {int: "an integer", float: "a number", str: "text", bool: "true or false"}.get(hint, str(hint))
 
 
-def _field_docs(cls: type) -> dict[str, str]:
+def field_docs(cls: type) -> dict[str, str]:
     """First sentences of the `Args:` section of a dataclass's docstring."""
     docs: dict[str, str] = {}
     for base in reversed(cls.__mro__):  # a field is described where it is declared
@@ -232,7 +242,7 @@ def _field_docs(cls: type) -> dict[str, str]:
 
 
 def _described(cls: type, name: str, hints: dict[str, Any]) -> str:
-    doc = _field_docs(cls).get(name, "")
+    doc = field_docs(cls).get(name, "")
     return f"({name}: {getattr(hints[name], '__name__', str(hints[name]))}{', ' + doc if doc else ''})"
 
 
@@ -242,7 +252,7 @@ def _unknown_key(path: str, key: str, cls: type, hints: dict[str, Any]) -> str:
     if not close:
         return f"{path}.{key}: no such key in {cls.__name__}. It has: {', '.join(names)}."
     field = next(f for f in dataclasses.fields(cls) if f.name == close[0])
-    doc = _field_docs(cls).get(close[0], "")
+    doc = field_docs(cls).get(close[0], "")
     kind = getattr(hints[close[0]], "__name__", str(hints[close[0]]))
     value = f" = {field.default!r}" if field.default is not dataclasses.MISSING else ""
     return (

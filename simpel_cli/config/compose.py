@@ -8,16 +8,21 @@ import os
 import secrets
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from simpel_cli.config.build import of_group
 from simpel_cli.config.folders import conf_dir, example_data_dir, recordings_dir, require_recordings
+from simpel_cli.config.group_classes import SIMULATORS
 from simpel_cli.config.groups import BROUGHT, CONTROL, group_folder, keys_of_other_verbs, top_level, user_conf
 from simpel_cli.config.hydra_errors import translated, unknown_root
 from simpel_cli.config.overrides import checked, swept_keys, value_of
+from simpel_cli.config.places import Layer, layers_of, with_place
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import refuse_occupied
+from simulators.quantity import ModelError
+from simulators.table_files import with_files_read
 
 
 class Job(typing.NamedTuple):
@@ -31,6 +36,7 @@ class Job(typing.NamedTuple):
     verb: str = "fit"
     sweep: Path | None = None  # directory of the sweep that it is a job of
     launcher: dict[str, Any] = {}  # noqa: RUF012  options of the sweep's launcher
+    layers: tuple[Layer, ...] = ()  # of a sweep's job: the YAML files that it is composed of
 
 
 class _Stopped(BaseException):
@@ -78,6 +84,7 @@ def launch(
                     raise ConfigError(unknown_root(str(key), verb, known))
                 del plain[key]
             folder = group_folder("data", hydra_config.runtime.choices.get("data"), user)
+            _read_tables(plain, hydra_config.runtime.choices, user)
             require_recordings(plain.get("data"))
             directory = Path(hydra_config.runtime.output_dir)
             if config_dir is not None and "choices" in plain:
@@ -98,11 +105,25 @@ def launch(
                     "fit" if verb == "sweep" else verb,
                     sweep,
                     launching or {},
+                    composed() if sweep else (),
                 )
             )
         except Exception as error:
+            layers.extend(composed())
             raise _Stopped from error
 
+    def composed() -> tuple[Layer, ...]:
+        with contextlib.suppress(Exception):  # where a key stands is no reason to lose what is wrong with it
+            hydra_config = HydraConfig.get()
+            choices = str(hydra_config.runtime.choices)
+            if choices not in files:  # jobs of a sweep differ in numbers mostly, seldom in files
+                files[choices] = tuple(layers_of(verb, hydra_config.overrides.task, folders))
+            return files[choices]
+        return ()
+
+    layers: list[Layer] = []
+    files: dict[str, tuple[Layer, ...]] = {}
+    folders = [*([user] if user else []), conf_dir()]
     failure: BaseException | None = None
     before, sys.argv = sys.argv, [verb, *words, *flags, *(["--config-dir", str(user)] if user else [])]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us as exceptions, not as Hydra's printout
@@ -110,13 +131,24 @@ def launch(
         with _mode_of_flags() if value_of("hydra.mode", overrides) is None else contextlib.nullcontext():
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(entry)()
     except _Stopped as stopped:
-        failure = translated(stopped.__cause__, verb, known, [*([user] if user else []), conf_dir()], own=False)
+        failure = translated(stopped.__cause__, verb, known, folders, own=False)
     except Exception as error:
-        failure = translated(error, verb, known, [*([user] if user else []), conf_dir()], own=True)
+        failure = translated(error, verb, known, folders, own=True)
     finally:
         sys.argv = before
     if failure is not None:  # raised here, so that no traceback shows our detour
-        raise failure
+        raise with_place(failure, layers, overrides)
+
+
+def _read_tables(config: dict[str, Any], choices: Mapping[str, Any], user: Path | None) -> None:
+    """Put the numbers of tables in place of their files, so that the configuration needs nothing beside it."""
+    for key in (key for key in SIMULATORS if isinstance(config.get(key), dict)):
+        chosen = choices.get("sim" if key == "sim" else f"sim@{key}")
+        folders = [group_folder("sim", chosen, user), group_folder("experiment", choices.get("experiment"), user)]
+        try:
+            config[key] = with_files_read(config[key], [*folders, Path.cwd()])
+        except ModelError as error:
+            raise ConfigError(of_group(str(error), key)) from error
 
 
 @contextlib.contextmanager

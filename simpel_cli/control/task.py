@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import casadi
 import jax
@@ -16,6 +16,7 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.expression import ExpressionError, parse, symbols_used
 from simulators.quantity import Quantity
+from simulators.sections import TERM, either, named, pair
 
 POINTS = 512  # of the declared ranges, at which a reward is looked at
 BEFORE = "_before"  # of an input's name: the command of the step before
@@ -90,6 +91,23 @@ class Task:
     stop: str = ""
     limits: Mapping[str, Any] = field(default_factory=dict)
     noise_std: Mapping[str, float] = field(default_factory=dict)
+
+    sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields whose type says too little
+        "names": named(TERM),
+        "initial": named(
+            either(
+                {"type": "number"},
+                pair({"type": "number"}, "[low, high] of a uniform value."),
+                {
+                    "type": "object",
+                    "properties": {"mean": {"type": "number"}, "std": {"type": "number", "minimum": 0}},
+                    "required": ["mean", "std"],
+                    "additionalProperties": False,
+                },
+            )
+        ),
+        "limits": named(pair({"type": "number"}, "[low, high] within the declared range.")),
+    }
 
     def __post_init__(self) -> None:
         for name in ("horizon", "settled"):

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.quantity import BETWEEN_ROWS
@@ -76,6 +76,21 @@ class Measurements:
     max_gap: float | int | None = None
     derived: tuple[str, ...] = ()
     between_rows: Mapping[str, str] = field(default_factory=dict)
+
+    sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields whose type says too little
+        "layout": {"enum": list(LAYOUTS)},
+        "choice": {"enum": list(CHOICES)},
+        "split": {
+            "type": "object",
+            "properties": {
+                "column": {"type": "string"},
+                "test_files": {"type": "array", "items": {"type": "string"}, "minItems": 1},
+                "test_fraction": {"type": "number", "minimum": 0, "exclusiveMaximum": 1},
+                "by": {"enum": list(SPLIT_BY)},
+            },
+            "additionalProperties": False,
+        },
+    }
 
     def __post_init__(self) -> None:
         if not all(isinstance(path, str) and path for path in self.paths):

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from simpel_cli.config.groups import options
+from simpel_cli.config.places import Layer, with_place
 from simpel_cli.config.resolved import load
 from simpel_cli.errors import ConfigError, SimpelError, did_you_mean
+from simpel_cli.reporting.equations import equations, roles_of, tables
 from simpel_cli.runs.console import Terminal, aligned
 from simulators.quantity import ModelError
+from simulators.table_files import with_files_read
 
 WIDTH = 48  # of a list of names in the table
 DECLARED = "simulators.model.Declared"
@@ -87,9 +90,10 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     from simpel_cli.config.build import build
 
     try:
-        model = build(entry.node, "sim", plugins).model()
-    except ModelError as error:
-        raise ConfigError(f"{entry.path}: {error}") from error
+        node = with_files_read(entry.node, [entry.path.parent, Path.cwd()])
+        model = build(node, "sim", plugins).model()
+    except (ModelError, ConfigError) as error:
+        raise with_place(ConfigError(str(error)), [Layer(entry.path, ("sim",))]) from error
     terminal.line(entry.comment)
     terminal.line(str(entry.path), "file")
     terminal.line(f"{model.dt:g} s per transition, {getattr(model, 'substeps', 1)} substeps", "step")
@@ -97,26 +101,26 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
     if late:
         delays = ", ".join(f"{k} {v} s" if isinstance(v, float) else f"{k} {v}" for k, v in late.items())
         terminal.line(delays, "delays")
+    roles = roles_of(model)
     for group in ("states", "inputs", "params", "outputs"):
         quantities = getattr(model, group, ())
         if quantities:
             terminal.line()
             head = ("parameter" if group == "params" else group[:-1], "unit", "from", "to", "")
-            rows = [(q.name, q.unit, _end(q.low), _end(q.high), _kind(q)) for q in quantities]
+            rows = [(q.name, q.unit, _end(q.low), _end(q.high), _kind(q, roles)) for q in quantities]
             terminal.line(aligned(head, rows))
+    if looked_up := tables(node):
+        terminal.line()
+        terminal.line(aligned(("table", "unit", "of", "method", "nodes", "values", "read from"), looked_up))
     fixed = getattr(model, "fixed", {})
     if fixed:
         terminal.line()
         terminal.line(", ".join(f"{k} = {v:g}" for k, v in fixed.items()), "known")
     terminal.line()
     target = str(entry.node.get("_target_", DECLARED))
-    dynamics = entry.node.get("dynamics") or {}
-    derived = {k: v for k, v in (entry.node.get("parameters") or {}).items() if isinstance(v, str)}
-    for left, formula in [*derived.items(), *((f"d{k}/dt", v) for k, v in dynamics.items())]:
-        terminal.line(f"  {left} = {formula}")
-    for left, formula in (entry.node.get("outputs") or {}).items():
-        terminal.line(f"  {left} = {formula['expression'] if isinstance(formula, Mapping) else formula}")
-    if not dynamics and target != DECLARED:
+    for line in equations(node):
+        terminal.line(f"  {line}")
+    if not entry.node.get("dynamics") and target != DECLARED:
         terminal.line(f"equations: {target}, in Python")
     if entry.node.get("gap"):
         terminal.line()
@@ -180,7 +184,7 @@ def _comment(path: Path) -> str:
     for line in path.read_text().splitlines():
         if not line.startswith("#"):
             break
-        if "@package" not in line:
+        if "@package" not in line and "yaml-language-server" not in line:
             lines.append(line.lstrip("# ").rstrip())
     return " ".join(filter(None, lines))
 
@@ -229,8 +233,7 @@ def _end(value: float) -> str:
     return f"{value:g}" if math.isfinite(value) else "-"
 
 
-def _kind(quantity: Any) -> str:
-    if getattr(quantity, "periodic", False):
-        return "angle"
+def _kind(quantity: Any, roles: Mapping[str, str]) -> str:
     prior = getattr(quantity, "prior", "uniform")
-    return "" if prior == "uniform" else str(prior)
+    words = ["angle" if getattr(quantity, "periodic", False) else "", roles.get(quantity.name, "")]
+    return ", ".join(filter(None, [*words, "" if prior == "uniform" else str(prior)]))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from simpel_cli.config.build import build_settings
+from simpel_cli.config.group_classes import SIMULATORS
 from simpel_cli.config.resolved import dump, of_run
 from simpel_cli.errors import ConfigError
 from simpel_cli.runs.directory import make_directory, refuse_occupied
@@ -13,6 +14,7 @@ from simpel_cli.runs.files import write_text
 from simpel_cli.runs.manifest import Manifest, read_manifest, refuse_changed_config
 from simpel_cli.runs.settings import Settings
 from simpel_cli.studies.declared import Declared, declare
+from simulators.table_files import files_of
 
 
 @contextlib.contextmanager
@@ -36,7 +38,8 @@ def new_run(
     settings = build_settings(config)
     refuse_occupied(make_directory(directory))
     write_text(directory / "config.yaml", dump(config | (beside or {})))
-    with Manifest(directory, verb, settings) as manifest:
+    tables = {file: digest for key in SIMULATORS for file, digest in files_of(config.get(key)).items()}
+    with Manifest(directory, verb, settings, inputs=tables) as manifest:
         yield declare(config, settings), manifest
 
 

@@ -9,6 +9,7 @@ from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
 from simpel_cli.config.compose import Job
+from simpel_cli.config.places import with_place
 from simpel_cli.config.resolved import of_run
 from simpel_cli.errors import ConfigError, Interrupted, SimpelError
 from simpel_cli.runs.console import silence
@@ -72,7 +73,7 @@ def perform(job: Job, stop: threading.Event | None = None) -> Outcome:
             else:
                 STARTS[job.verb](job)
     except SimpelError as failure:
-        code, error = failure.exit_code, str(failure)
+        code, error = failure.exit_code, str(with_place(failure, job.layers, job.given))
     except KeyboardInterrupt:
         code, error = Interrupted.exit_code, "stopped"
     except Exception:  # whatever it is, it costs this job and no other; the traceback is kept beside it

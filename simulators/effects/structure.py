@@ -6,20 +6,26 @@ import casadi
 import numpy as np
 
 from simulators.model import Model
+from simulators.quantity import READING
+
+VELOCITIES = ("m/s", "rad/s", "deg/s", "1/min", "rpm")  # units that nothing else than a velocity has
+_FIRST_ORDER = ("level", "temperature", "other")
 
 
 class Structure(NamedTuple):
     """Roles of a model's states.
 
     Args:
-        kinematic: rates that hold by definition (a position's rate is a velocity); no force acts there.
+        kinematic: rates that hold by definition (a position's rate is a velocity; a reading follows); no force acts there.
         velocity: rates that forces act on -> the state that this one is the rate of, or None where there is none.
         first_order: all other rates: levels, temperatures, concentrations.
+        inferred: state -> what its role was read off, where nothing was declared and it is not first-order.
     """
 
     kinematic: tuple[str, ...]
     velocity: dict[str, str | None]
     first_order: tuple[str, ...]
+    inferred: dict[str, str]
 
     @property
     def dynamic(self) -> tuple[str, ...]:
@@ -28,33 +34,41 @@ class Structure(NamedTuple):
 
 
 def structure(model: Model) -> Structure:
-    """Read the roles off the right-hand side and the units.
+    """Read the roles off what is declared; where nothing is, off the right-hand side and the units.
 
     A rate is kinematic if it is another state itself, or depends on states alone, one of which has its unit. A state is
-    a velocity if a kinematic rate depends on it and it has that rate's unit, or if its unit is one of m/s and rad/s.
+    a velocity if a kinematic rate depends on it and it has that rate's unit, or if its unit is one of `VELOCITIES`.
     """
     on_x, on_u, on_p = depends(model)
-    units = [_plain(q.unit) for q in model.states]
+    names, units = [q.name for q in model.states], [_plain(q.unit) for q in model.states]
     identity = _identities(model)
-    kinematic: dict[int, int] = {}
-    for i in range(len(model.states)):
-        if on_p[i].any() or on_u[i].any():
+    kinematic: dict[int, int | None] = {}
+    for i, q in enumerate(model.states):
+        declared = q.role in ("position", READING)
+        if q.role and not declared:
             continue
-        of_rate = [j for j in np.flatnonzero(on_x[i]) if j != i and (units[j] and units[j] == _plain(f"{units[i]}/s"))]
-        source = of_rate[0] if of_rate else identity.get(i)
-        if source is not None:
-            kinematic[i] = int(source)
-    names = [q.name for q in model.states]
-    position = {j: i for i, j in kinematic.items() if identity.get(i) == j}
+        source = None
+        if q.role != READING and not on_p[i].any() and not on_u[i].any():
+            others = [j for j in np.flatnonzero(on_x[i]) if j != i and units[j]]
+            of_rate = [int(j) for j in others if units[j] == _plain(f"{units[i]}/s")]
+            source = of_rate[0] if of_rate else identity.get(i)
+        if declared or source is not None:
+            kinematic[i] = source
+    position = {j: i for i, j in kinematic.items() if j is not None and identity.get(i) == j}
+    of_position = {j: i for i, j in kinematic.items() if j is not None}
     velocity, first = {}, []
-    for j, name in enumerate(names):
+    inferred = {names[i]: f"its rate is {names[j]}" for i, j in kinematic.items() if j is not None}
+    for j, q in enumerate(model.states):
         if j in kinematic:
             continue
-        if j in kinematic.values() or units[j] in ("m/s", "rad/s"):
-            velocity[name] = names[position[j]] if j in position else None
-        else:
-            first.append(name)
-    return Structure(tuple(names[i] for i in kinematic), velocity, tuple(first))
+        if q.role in _FIRST_ORDER or not (q.role or j in of_position or units[j] in VELOCITIES):
+            first.append(q.name)
+            continue
+        velocity[q.name] = names[position[j]] if j in position else None
+        inferred[q.name] = f"unit {q.unit}" if units[j] in VELOCITIES else f"the rate of {names[of_position.get(j, j)]}"
+    said = {q.name for q in model.states if q.role}
+    inferred = {name: why for name, why in inferred.items() if name not in said}
+    return Structure(tuple(names[i] for i in kinematic), velocity, tuple(first), inferred)
 
 
 def depends(model: Model) -> tuple[np.ndarray, ...]:

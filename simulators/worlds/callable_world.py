@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from simulators.definitions import UNCERTAIN
 from simulators.model import Declared, ModelError, Quantity
+from simulators.quantity import VARIABLE
+from simulators.sections import GAP, NUMBER, keys, named
 
 Function = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -36,6 +39,14 @@ class CallableWorld:
     inputs: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
+
+    sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields
+        "dt": NUMBER,
+        "states": named(keys(VARIABLE, ("range",))),
+        "inputs": named(keys(VARIABLE, ("range",))),
+        "parameters": named(keys(UNCERTAIN, ("range",))),
+        "gap": GAP,
+    }
 
     def model(self) -> "QueriedFunction":
         """Check everything and build the world.

@@ -4,13 +4,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import mujoco
 import numpy as np
 
 from simulators.expression import did_you_mean
 from simulators.model import Declared, ModelError
+from simulators.sections import GAP, NUMBER, keys, named
 from simulators.worlds.compiled_world import CompiledWorld, Setting, commands_on_their_way
 
 FOLDER = Path(__file__).parent
@@ -68,6 +69,11 @@ class MujocoWorld:
     inputs: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
+
+    sections: ClassVar[dict[str, Any]] = {"dt": NUMBER, "gap": GAP} | {  # JSON schemas of fields
+        section: named(keys((*MEANING[section], *needed, *optional), needed))
+        for section, (needed, optional) in PLACES.items()
+    }
 
     def model(self) -> CompiledWorld:
         """Check everything and build the world.

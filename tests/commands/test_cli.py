@@ -22,7 +22,7 @@ from simpel_cli.runs.manifest import sha256
 
 VERBS = [
     "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "sims", "effects", "example",
-    "doctor", "simulate",
+    "doctor", "simulate", "schema",
 ]  # fmt: skip
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),

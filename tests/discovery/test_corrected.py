@@ -15,7 +15,9 @@ from simpel_cli.discovery.search.setup import terms_of
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict import corrected as module
 from simulators.effects import Scales, Term
+from simulators.model import Model
 
+OF_A_SHAFT = ("coulomb_friction", "input_offset", "input_saturation")
 CASES = {
     "rc_car": ("rolling_resistance", "traction_limit", "tyre_slip", "input_saturation"),
     "racecar": ("rolling_resistance", "traction_limit", "input_saturation", "input_delay"),
@@ -27,9 +29,11 @@ def node_of(group: str, name: str) -> dict[str, Any]:
     return yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
 
 
-def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> tuple[Any, ...]:
-    """Return the corrected model with the terms at their starts, its terms, and what was left out."""
-    node = node_of("sim", sim)
+def written(
+    sim: str | dict[str, Any], effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> tuple[Model, list[Term], dict[str, Any], list[str]]:
+    """Return the model, the terms, the corrected YAML with the terms at their starts, and what was left out."""
+    node = node_of("sim", sim) if isinstance(sim, str) else sim
     model = build(node, "sim").model()
     scales = Scales(
         {q.name: 1.0 for q in (*model.states, *model.inputs)}, {q.name: 2.0 for q in model.states}, model.dt
@@ -48,13 +52,37 @@ def written(sim: str, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch)
     nothing = Optimum(np.zeros(1), (), 0.0, 0.0, np.zeros(0), np.eye(1), np.zeros(0), np.eye(1), 0, True)
     trial = Trial(tuple(reversed(range(len(terms)))), nothing)
     _, corrected, left_out = module.corrected(node, model, search, trial)
-    return model, terms, build(corrected, "sim").model(), left_out
+    return model, terms, corrected, left_out
 
 
-@pytest.mark.parametrize("sim", CASES)
+SHAFT = {
+    "name": "shaft",
+    "dt": 0.1,
+    "states": {
+        "angle": {"unit": "rad", "range": [-9, 9], "role": "position"},
+        "n": {"unit": "1/s", "range": [-10, 10], "role": "velocity"},
+    },
+    "inputs": {"u": {"unit": "V", "range": [-1, 1]}},
+    "parameters": {"gear": {"unit": "1", "range": [0.1, 0.2]}, "k": 0.3, "w": 1.0},
+    "intermediates": {"push": {"unit": "1/s^2", "expression": "torque + 0.1*u*n"}, "tau_c": "k*n"},
+    "tables": {"torque": {"inputs": ["u", "n"], "axes": [[-1, 1], [-9, 9]], "values": [[-3, -1], [2, 4]]}},
+    "dynamics": {"angle": "gear*n", "n": "push - tau_c"},
+    "outputs": {
+        "amps": {"unit": "A", "expression": "torque*u", "scale": "k", "bias": 0.1, "saturates": [-0.5, 0.5]},
+        "tacho": {"unit": "V", "expression": "n", "scale": 2, "lag": 0.2, "range": [-20, 20]},
+    },
+}
+
+
+@pytest.mark.parametrize("sim", [*CASES, "shaft", "in Python"])
 def test_the_yaml_has_the_rates_that_were_fitted(sim: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, terms, new, left_out = written(sim, CASES[sim], monkeypatch)
-    together = augment(model, terms, [q.name for q in model.states])
+    node: Any = {"shaft": SHAFT, "in Python": {"_target_": module.EXTENDED, "name": "more", "base": SHAFT}}.get(
+        sim, sim
+    )
+    model, terms, corrected, left_out = written(node, CASES.get(sim, OF_A_SHAFT), monkeypatch)
+    new = build(corrected, "sim").model()
+    assert (new.states, new.saturation) == (model.states, model.saturation)
+    together = augment(model, terms, [q.name for q in (*model.states, *model.outputs)])
     random, parameters = np.random.default_rng(0), [k.starts[0] for t in terms for k in t.parameters]
     assert left_out == []
     for term in terms:
@@ -69,13 +97,29 @@ def test_the_yaml_has_the_rates_that_were_fitted(sim: str, monkeypatch: pytest.M
             np.asarray(f(x, u, q)[0]).ravel()
             for f, q in ((together.function, [*p, *parameters]), (model.function(), p))
         )
-        np.testing.assert_allclose(np.asarray(new.function()(x, u, p)[0]).ravel(), fitted, rtol=1e-9, atol=1e-9)
+        rates, outputs = (np.asarray(part).ravel() for part in new.function()(x, u, p))
+        np.testing.assert_allclose(rates, fitted, rtol=1e-9, atol=1e-9)
+        measured = np.asarray(together.function(x, u, [*p, *parameters])[1]).ravel()
+        np.testing.assert_allclose(outputs, measured[len(model.states) :], rtol=1e-9, atol=1e-9)
         changed = max(changed, float(np.abs(fitted - old).max()))
     assert changed > 0.1
 
 
+def test_intermediates_tables_roles_and_sensors_are_carried_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, _, corrected, _ = written(SHAFT, OF_A_SHAFT, monkeypatch)
+    assert corrected["states"] == SHAFT["states"]
+    assert corrected["tables"]["torque"] == SHAFT["tables"]["torque"] | {"inputs": ["u_acting", "n"]}
+    assert corrected["intermediates"].keys() == {"push", "tau_c", "u_acting"}
+    # the friction has parameters called tau_c and w, two names that the simulator has already
+    assert {"tau_c_n", "w_n"} <= corrected["parameters"].keys()
+    for name, own in SHAFT["outputs"].items():
+        assert corrected["outputs"][name] | {"expression": ""} == own | {"expression": ""}
+    assert SHAFT["tables"]["torque"]["inputs"] == ["u", "n"]  # what was declared is not changed
+
+
 def test_what_a_transition_cannot_hold_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _, new, left_out = written("pendulum", ("input_backlash", "sensor_lag", "input_lag"), monkeypatch)
+    model, _, corrected, left_out = written("pendulum", ("input_backlash", "sensor_lag", "input_lag"), monkeypatch)
+    new = build(corrected, "sim").model()
     assert new.lag == {"u": "tau"}
     assert model.lag == {}
     assert [text.split(" (")[0] for text in left_out] == ["sensor_lag on phi", "input_backlash on u"]

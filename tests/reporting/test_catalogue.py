@@ -67,3 +67,58 @@ def test_doctor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.code == 1
     assert "error: gradients, files: this installation computes or stores wrong results" in result.err
     assert "OSError: no room" in result.out
+
+
+MOTOR = """\
+# A motor on a test bench.
+name: motor
+dt: 0.1
+states:
+  angle: {unit: rad, range: [-9, 9], role: position}
+  n: {unit: 1/min, range: [0, 6000]}
+  T: {unit: K, range: [0, 90], role: temperature}
+inputs: {u: {unit: "1", range: [0, 1]}}
+parameters: {J: {unit: kg m^2, range: [0.1, 0.2]}, gain: 2.0}
+intermediates:
+  w: {unit: rad/s, expression: n*pi/30}
+  net: torque - 0.01*n
+tables:
+  torque: {unit: N m, inputs: [n, u], file: map.csv}
+dynamics: {angle: w, n: net/J, T: u - T}
+outputs:
+  volts: {unit: V, expression: w, scale: gain, bias: -1, saturates: [0, null]}
+  tacho: {unit: 1/min, expression: n, lag: 0.2, range: [0, 6000]}
+"""
+
+
+def test_intermediates_tables_roles_and_sensors_are_shown(tmp_path: Path) -> None:
+    (tmp_path / "conf" / "sim").mkdir(parents=True)
+    (tmp_path / "conf" / "sim" / "motor.yaml").write_text(MOTOR)
+    (tmp_path / "conf" / "sim" / "map.csv").write_text("n,u,torque\n0,0,-1\n0,1,9\n6000,0,-4\n6000,1,5\n")
+    result = simpel(tmp_path, "sims", "motor", "--config-dir", "conf")
+    assert result.code == 0, result.err
+    lines = [" ".join(line.split()) for line in result.out.splitlines()]
+    for line in (
+        "angle rad -9 9 position",
+        "n 1/min 0 6000 velocity (inferred: unit 1/min)",
+        "T K 0 90 temperature",
+        "tacho 1/min 0 6000 lagging reading",
+        "volts V - -",
+        "torque N m n, u linear 2 x 2 -4 to 9 map.csv",
+        "w = n*pi/30 [rad/s]",
+        "net = torque - 0.01*n",
+        "torque = table of n, u [N m]",
+        "dn/dt = net/J",
+        "volts = gain*w - 1 [V] (saturates at 0 and no end)",
+        "tacho = n [1/min] (follows with a lag of 0.2 s)",
+    ):
+        assert line in lines, result.out
+    more = "_target_: simulators.extended.Extended\nname: more\ndynamics: {n: -0.1*n}\nbase:\n"
+    base = "".join(f"  {line}\n" for line in MOTOR.splitlines())
+    (tmp_path / "conf" / "sim" / "more.yaml").write_text(more + base)
+    shown = simpel(tmp_path, "sims", "more", "--config-dir", "conf").out
+    for line in ("dn/dt = net/J", "dn/dt = rate_n + -0.1*n", "2 x 2"):
+        assert line in shown
+    shown = simpel(tmp_path, "sims", "pendulum").out
+    assert "velocity (inferred: unit rad/s)" in shown
+    assert "angle, position (inferred: its rate is omega)" in shown

@@ -140,7 +140,7 @@ def refuse_far(recording: Recording, model: Model) -> None:
     names = measured(recording, model)
     columns = {n: np.concatenate([column(e, n, recording, model) for e in episodes]) for n in names}
     columns |= {q.name: np.concatenate([e.inputs[:, j] for e in episodes]) for j, q in enumerate(model.inputs)}
-    for q in (*model.states, *model.inputs, *model.outputs):
+    for q in (*model.states, *model.inputs):  # outputs have no range
         values = columns.get(q.name)
         if values is None or not np.isfinite(values).any():
             continue

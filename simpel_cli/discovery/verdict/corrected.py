@@ -1,5 +1,6 @@
 """The corrected simulator as YAML that `simpel fit` reads: the declared one, with the effects as terms."""
 
+import itertools
 import re
 from typing import Any
 
@@ -8,8 +9,10 @@ from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simulators.effects import Term
 from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR
 from simulators.model import Model
+from simulators.quantity import READING
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
+NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
 _SENSOR = "a simulator describes the system, not its sensors: correct the measurements instead"
 CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
     BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain"
@@ -31,12 +34,14 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     terms = [search.terms[t] for t in trial.terms]
     name = f"{sim['name']}_with_" + "_and_".join(t.effect for t in terms)
     taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
-    taken |= {*model.fixed, *(sim.get("parameters") or {})}
+    taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
+    readings = {q.name for q in model.states if q.role == READING}
+    cannot = {t: _SENSOR if readings & t.rates.keys() else CANNOT.get(t.kind) for t in terms}
     written: list[Term] = []
     names: dict[str, str] = {}
     parameters: dict[str, Any] = {}
     for index, term in sorted(zip(trial.terms, terms, strict=True)):
-        if term.kind in CANNOT:
+        if cannot[term]:
             continue
         written.append(term)
         for parameter, row in zip(term.parameters, search.rows[index], strict=True):
@@ -55,7 +60,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             )
     write = _declared if sim.get("_target_", DECLARED) == DECLARED else _extended
     node = write(sim, name, written, names, parameters)
-    return name, node, [f"{t.label} ({CANNOT[t.kind]})" for t in terms if t.kind in CANNOT]
+    return name, node, [f"{t.label} ({cannot[t]})" for t in terms if cannot[t]]
 
 
 def _extended(
@@ -97,14 +102,28 @@ def _declared(
     base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
     rates = {f"rate_{state}": f"({text})" for state, text in base.items()}
     node["dynamics"] = dict(base)
-    for output, own in (node.get("outputs") or {}).items():
-        new = _renamed(str(own["expression"] if isinstance(own, dict) else own), given)
-        node["outputs"][output] = own | {"expression": new} if isinstance(own, dict) else new
+    for section in ("intermediates", "outputs"):
+        for key, own in (node.get(section) or {}).items():
+            new = _renamed(str(own["expression"] if isinstance(own, dict) else own), given)
+            node[section][key] = own | {"expression": new} if isinstance(own, dict) else new
+    _look_up_changed_inputs(node, given)
     for term in terms:
         for state, text in term.rates.items():
             swap = names | given | (rates if term.several else {"rate": rates[f"rate_{state}"]})
             node["dynamics"][state] += f" + ({_renamed(text, swap)})"
     return node
+
+
+def _look_up_changed_inputs(node: dict[str, Any], given: dict[str, str]) -> None:
+    """Give a name to each changed input that a table has, since a table takes names only."""
+    taken = {name for key in NAMES for name in node.get(key) or {}}
+    acting: dict[str, str] = {}
+    for key, table in (node.get("tables") or {}).items():
+        for name in (name for name in table["inputs"] if name in given and name not in acting):
+            free = next(n for i in itertools.count() if (n := f"{name}_acting{i or ''}") not in taken)
+            acting[name] = free
+            node["intermediates"] = (node.get("intermediates") or {}) | {free: given[name]}
+        node["tables"][key] = table | {"inputs": [acting.get(name, name) for name in table["inputs"]]}
 
 
 def _renamed(text: str, swap: dict[str, str]) -> str:
