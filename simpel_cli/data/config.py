@@ -84,12 +84,15 @@ class Measurements:
             "type": "object",
             "properties": {
                 "column": {"type": "string"},
+                "test": {"type": "array", "items": {"type": "string"}, "minItems": 1},
                 "test_files": {"type": "array", "items": {"type": "string"}, "minItems": 1},
                 "test_fraction": {"type": "number", "minimum": 0, "exclusiveMaximum": 1},
                 "by": {"enum": list(SPLIT_BY)},
             },
             "additionalProperties": False,
         },
+        "noise": {"type": "object", "properties": {"law": {"enum": list(LAWS)}}, "additionalProperties": False},
+        "between_rows": {"type": "object", "additionalProperties": {"enum": list(BETWEEN_ROWS)}},
     }
 
     def __post_init__(self) -> None:
