@@ -1,0 +1,59 @@
+"""A file of any kind that can be read, as a `Sheet`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from simpel_cli.data.tables.csv_file import COMMA, Dialect, read_csv
+from simpel_cli.data.tables.csv_header import Header
+from simpel_cli.data.tables.parquet_file import read_parquet
+from simpel_cli.data.tables.sheet import Sheet
+from simpel_cli.errors import DataError
+
+Reader = Callable[[Path], Sheet]
+
+
+def read_sheet(path: Path) -> Sheet:
+    """Read a file by its extension.
+
+    Raises:
+        DataError: it has another extension, or the file is empty, damaged, has no rows, repeats a name or is written in a way
+            that cannot be read.
+    """
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        *most, last = READERS
+        raise DataError(
+            f"data.path: {path.name} ends in '{path.suffix}', only {', '.join(most)} or {last} can be read."
+        )
+    if path.stat().st_size == 0:
+        raise DataError(f"{path.name} is empty (0 bytes).")
+    sheet = reader(path)
+    if not sheet.columns:
+        raise DataError(f"{path.name} has no named columns.")
+    if len(sheet) == 0:
+        raise DataError(f"{path.name} has a header ({', '.join(sheet.columns)}) but no rows.")
+    return sheet
+
+
+def _read_csv(path: Path) -> Sheet:
+    columns, header, dialect = read_csv(path)
+    unusable = {
+        name: f"'{name}' of {path.name} may be {' or '.join(map(repr, texts))}. Name the column by its whole header."
+        for name, texts in header.doubtful.items()
+    }
+    return Sheet(path, columns, header.units, dialect, header.full, unusable, _notes(header, dialect))
+
+
+def _notes(header: Header, dialect: Dialect) -> tuple[str, ...]:
+    notes = []
+    if header.units:
+        notes.append("units in a row of their own" if dialect.units else "units in the header")
+    if dialect.decimal == COMMA:
+        notes.append("decimal commas")
+    return tuple(notes)
+
+
+READERS: dict[str, Reader] = {
+    ".parquet": read_parquet,
+    ".csv": _read_csv,
+}
