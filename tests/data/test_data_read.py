@@ -216,7 +216,7 @@ def test_file_is_missing_or_of_another_kind(tmp_path: Path) -> None:
     assert str(tmp_path) in str(error.value)
     assert str(Path.cwd()) in str(error.value)
     (tmp_path / "run.xlsx").write_text("x")
-    with pytest.raises(DataError, match=r"'.xlsx', only .parquet or .csv"):
+    with pytest.raises(DataError, match=r"'.xlsx', only .parquet, .csv, "):
         read(Measurements("run.xlsx"), CART, tmp_path, 0)
 
 

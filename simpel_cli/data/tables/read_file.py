@@ -5,6 +5,8 @@ from pathlib import Path
 
 from simpel_cli.data.tables.csv_file import COMMA, Dialect, read_csv
 from simpel_cli.data.tables.csv_header import Header
+from simpel_cli.data.tables.hdf5_file import read_hdf5
+from simpel_cli.data.tables.mat_file import read_mat
 from simpel_cli.data.tables.parquet_file import read_parquet
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError
@@ -56,4 +58,7 @@ def _notes(header: Header, dialect: Dialect) -> tuple[str, ...]:
 READERS: dict[str, Reader] = {
     ".parquet": read_parquet,
     ".csv": _read_csv,
+    ".mat": read_mat,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
 }

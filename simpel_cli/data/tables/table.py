@@ -104,8 +104,9 @@ class Table:
 
     def missing(self, column: str, cure: str) -> DataError:
         """Error for a column that the files do not have."""
-        if column in self.unusable:
-            return DataError(f"{self.unusable[column]}\n{cure}")
+        for name, why in self.unusable.items():
+            if column == name or column.startswith(f"{name}."):  # a field of a struct that cannot be read
+                return DataError(f"{why}\n{cure}")
         hint = did_you_mean(column, [*self.columns, *self.full])
         has = ", ".join(self.columns)
         return DataError(f"column '{column}' is missing in {self.name} (it has: {has}).{hint}\n{cure}")
