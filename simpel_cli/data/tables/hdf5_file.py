@@ -10,7 +10,7 @@ from simpel_cli.data.tables.arrays import MOST_COLUMNS, Array, sheet_of
 from simpel_cli.data.tables.optional import library
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.data.unit_words import canonical
-from simpel_cli.errors import DataError
+from simpel_cli.errors import DataError, SimpelError
 
 SAVE = "A column is a dataset with one entry per sample."
 
@@ -28,7 +28,7 @@ def read_hdf5(path: Path) -> Sheet:
         with h5py.File(path, "r") as file:
             for name, dataset in _datasets(file, h5py, ""):
                 _add(name, dataset, path.name, arrays, unusable)
-    except DataError:
+    except SimpelError:
         raise
     except Exception as error:  # of a damaged file; h5py raises OSError, KeyError, RuntimeError, ...
         raise DataError(f"{path.name} is damaged, cut off or no HDF5 file. Copy or write it again.") from error

@@ -10,7 +10,7 @@ from simpel_cli.data.tables.arrays import Array, sheet_of
 from simpel_cli.data.tables.mat_cures import cure
 from simpel_cli.data.tables.optional import library
 from simpel_cli.data.tables.sheet import Sheet
-from simpel_cli.errors import DataError
+from simpel_cli.errors import DataError, SimpelError
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 TEXT_HEADER = 512  # bytes
@@ -46,7 +46,7 @@ def read_mat(path: Path) -> Sheet:
     found = _Contents(path.name)
     try:
         (_read_hdf5 if newest else _read_old)(path, found)
-    except DataError:
+    except SimpelError:
         raise
     except Exception as error:  # of a damaged file; the libraries raise whatever their parsers stumble over
         raise DataError(f"{path.name} is damaged, cut off or no MATLAB file. Copy or save it again.") from error

@@ -7,7 +7,9 @@ from simpel_cli.data.tables.csv_file import COMMA, Dialect, read_csv
 from simpel_cli.data.tables.csv_header import Header
 from simpel_cli.data.tables.hdf5_file import read_hdf5
 from simpel_cli.data.tables.mat_file import read_mat
+from simpel_cli.data.tables.mcap_file import read_mcap
 from simpel_cli.data.tables.parquet_file import read_parquet
+from simpel_cli.data.tables.rosbag import read_rosbag
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError
 
@@ -15,19 +17,19 @@ Reader = Callable[[Path], Sheet]
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read a file by its extension.
+    """Read a file by its extension, or the folder of a rosbag2.
 
     Raises:
         DataError: it has another extension, or the file is empty, damaged, has no rows, repeats a name or is written in a way
             that cannot be read.
     """
-    reader = READERS.get(path.suffix.lower())
+    reader = read_rosbag if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
-        *most, last = READERS
         raise DataError(
-            f"data.path: {path.name} ends in '{path.suffix}', only {', '.join(most)} or {last} can be read."
+            f"data.path: {path.name} ends in '{path.suffix}', only {', '.join(READERS)} and the folder of a rosbag2 can be "
+            "read."
         )
-    if path.stat().st_size == 0:
+    if path.is_file() and path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes).")
     sheet = reader(path)
     if not sheet.columns:
@@ -61,4 +63,6 @@ READERS: dict[str, Reader] = {
     ".mat": read_mat,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
+    ".mcap": read_mcap,
+    ".db3": read_rosbag,
 }
