@@ -21,8 +21,8 @@ from safetensors.numpy import load_file
 from simpel_cli.runs.manifest import sha256
 
 VERBS = [
-    "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "sims", "effects", "example",
-    "doctor", "simulate",
+    "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "import", "sims", "effects",
+    "example", "doctor", "simulate",
 ]  # fmt: skip
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),
