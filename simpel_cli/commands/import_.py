@@ -12,9 +12,7 @@ from simpel_cli.errors import ConfigError
 def import_(
     files: Annotated[
         list[str],
-        typer.Argument(
-            metavar="FILE... [sim=NAME]", help="Measurements: files, or a pattern in quotes ('runs/*.csv')."
-        ),
+        typer.Argument(metavar="FILE...", help="Measurements: files, or a pattern in quotes ('runs/*.csv')."),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Write the YAML here, e.g. my/data/rig.yaml. Default: print it.")

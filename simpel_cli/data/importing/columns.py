@@ -12,6 +12,7 @@ from simpel_cli.errors import DataError
 JUMP = 20.0  # times the step that 95 % of the others do not exceed
 FEW = 0.03  # of the steps; more are no jumps, but how the column is
 TURNS = {2 * math.pi: "rad", 360.0: "degrees"}
+LEVELS = 10  # a switch, a gear, a step of an input
 NEARLY = 0.1  # of a turn, between the ends of an angle that wraps
 WRAP = 0.7  # of a turn, at least, where it does
 PATIENCE = 0.5  # share of the entries that are numbers, above which a column of texts is one of numbers with faults
@@ -41,7 +42,7 @@ class Column(NamedTuple):
 
 
 def columns_of(table: Table) -> list[Column]:
-    """Look at every column of a table.
+    """Look at every column of a table, without its jumps: they are told once it is known where episodes begin.
 
     Raises:
         DataError: none of them holds numbers.
@@ -49,14 +50,27 @@ def columns_of(table: Table) -> list[Column]:
     units: dict[str, str] = {}
     for sheet in table.sheets:
         units = read_card(sheet.path)[0] | sheet.units | units
-    follows = table.file[1:] == table.file[:-1]
-    found = [_column(table, name, units.get(name, ""), follows) for name in table.columns]
+    found = [_column(table, name, units.get(name, "")) for name in table.columns]
     if all(column.values is None for column in found):
         raise DataError(f"{table.name}: none of its columns holds numbers (it has: {', '.join(table.columns)}).")
     return found
 
 
-def _column(table: Table, name: str, unit: str, follows: np.ndarray) -> Column:
+def with_jumps(columns: list[Column], starts: np.ndarray) -> list[Column]:
+    """Say which columns jump within an episode.
+
+    Args:
+        columns: of numbers and texts.
+        starts: rows at which an episode begins, (k,).
+    """
+    done = []
+    for column in columns:
+        said = "" if column.values is None or column.constant else _jumps(column.values, starts, column.unit)
+        done.append(column._replace(remarks=(*column.remarks, said)) if said else column)
+    return done
+
+
+def _column(table: Table, name: str, unit: str) -> Column:
     try:
         values = table.numbers(name)
     except DataError as error:
@@ -67,8 +81,7 @@ def _column(table: Table, name: str, unit: str, follows: np.ndarray) -> Column:
     remarks = [f"{int((~finite).sum())} entries missing"] if not finite.all() else []
     if np.ptp(values[finite]) == 0:
         return Column(name, unit, values, (f"constant, {values[finite][0]:.6g}", *remarks), ())
-    jumps = _jumps(values, follows, unit)
-    return Column(name, unit, values, (*remarks, *([jumps] if jumps else [])), ())
+    return Column(name, unit, values, tuple(remarks), ())
 
 
 def _texts(table: Table, name: str, unit: str, fault: str) -> Column:
@@ -84,11 +97,11 @@ def _texts(table: Table, name: str, unit: str, fault: str) -> Column:
     return Column(name, unit, None, (f"text: {shown}" if distinct else "empty",), ())
 
 
-def _jumps(values: np.ndarray, follows: np.ndarray, unit: str) -> str:
-    """Say that a column jumps, or wraps as an angle does; empty: it does not."""
-    steps = np.abs(np.diff(values))[follows]
+def _jumps(values: np.ndarray, starts: np.ndarray, unit: str) -> str:
+    """Say that a column jumps, or wraps as an angle does; empty: it does not, or has a few levels only."""
+    steps = np.abs(np.delete(np.diff(values), starts[starts > 0] - 1))
     steps = steps[np.isfinite(steps)]
-    if len(steps) < 10:
+    if len(steps) < 10 or len(np.unique(values[np.isfinite(values)])) <= LEVELS:
         return ""
     for turn, name in TURNS.items():
         wraps = int(np.sum(steps > WRAP * turn))

@@ -10,7 +10,7 @@ import numpy as np
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.estimation.kinematics import Motion, difference_kind
 from simpel_cli.data.importing.clock import Clock, clock_of
-from simpel_cli.data.importing.columns import Column, columns_of
+from simpel_cli.data.importing.columns import Column, columns_of, with_jumps
 from simpel_cli.data.importing.episodes import Parts, parts_of
 from simpel_cli.data.importing.match import Matched, match
 from simpel_cli.data.importing.text import Line, yaml_of
@@ -66,7 +66,9 @@ def draft(files: Sequence[str], shown: Sequence[str], folder: Path, model: Sourc
     looked = _looked(files, folder, model)
     node, lines, asked = _keys(shown, looked, model)
     recording = fault = None
-    if model is not None:
+    if len(looked.clock.starts) and looked.parts.episode is None:
+        fault = "its episodes have no names, see the questions"
+    elif model is not None:
         try:
             trial: dict[str, Any] = {
                 k: tuple(v) if isinstance(v, list) else v for k, v in (node | {"path": list(files)}).items()
@@ -98,6 +100,8 @@ def _looked(files: Sequence[str], folder: Path, model: Source | None) -> _Looked
     transitions = any(name.removeprefix("next_") in names for name in names if name.startswith("next_"))
     clock = Clock(None) if transitions else clock_of(columns, table.file, None if model is None else model.dt)
     parts = parts_of(table, columns, clock)
+    ends = np.flatnonzero(table.file[1:] != table.file[:-1]) + 1
+    columns = with_jumps(columns, np.union1d(ends, parts.starts))
     taken = {clock.column, parts.episode, parts.split}
     free = [c for c in columns if c.name not in taken and not (transitions and c.name.startswith("next_"))]
     return _Looked(table, columns, clock, parts, None if model is None else match(model, free), transitions)
@@ -225,7 +229,7 @@ def _differences(looked: _Looked) -> list[str]:
     if clock.column is None or len(numbers) > MOST_COMPARED:
         return []
     changes = np.flatnonzero(table.file[1:] != table.file[:-1]) + 1
-    cuts = sorted({0, *changes.tolist(), *clock.starts.tolist(), len(table)})
+    cuts = sorted({0, *changes.tolist(), *looked.parts.starts.tolist(), len(table)})
     time = table.numbers(clock.column) * clock.factor
     pieces = [slice(a, b) for a, b in pairwise(cuts) if b - a > 2]
     found = []

@@ -25,12 +25,14 @@ class Parts(NamedTuple):
         episode: column; None: there is none, or it is not sure which.
         split: column with the values train and test; None: there is none.
         episodes: number of episodes, those of the files if no column names them.
+        starts: rows at which one begins within a file, (k,).
         questions: what only a person can tell.
     """
 
     episode: str | None
     split: str | None
     episodes: int
+    starts: np.ndarray
     questions: tuple[str, ...] = ()
 
 
@@ -49,20 +51,19 @@ def parts_of(table: Table, columns: Sequence[Column], clock: Clock) -> Parts:
     blocks = {n: _changes(t, file) for n, t in labels.items() if n != split and _in_blocks(t, file)}
     if len(clock.starts):
         same = [name for name, changes in blocks.items() if np.array_equal(changes, clock.starts)]
-        named = [name for name in same if _is_named(name)] or same
-        if len(named) == 1:
-            return Parts(named[0], split, len(clock.starts) + files)
-        which = f"Is it one of {', '.join(named)}?" if named else "No column changes with it."
+        if same:  # all of them part the rows alike: take one that is called so
+            return Parts(next(filter(_is_named, same), same[0]), split, len(clock.starts) + files, clock.starts)
         question = (
             f"{clock.column} starts anew {len(clock.starts)} times, first at {table.place(int(clock.starts[0]))}: these are "
-            f"several episodes, which a column has to name. {which} Write `episode: NAME`, and `time: {clock.column}` above it."
+            "several episodes, which a column has to name, and none changes just there. Write `episode: NAME`, and "
+            f"`time: {clock.column}` above it, or cut the file."
         )
-        return Parts(None, split, len(clock.starts) + files, (question,))
+        return Parts(None, split, len(clock.starts) + files, clock.starts, (question,))
     named = [name for name in blocks if _is_named(name)]
-    if len(named) == 1:
-        return Parts(named[0], split, len(set(labels[named[0]].tolist())))
+    if named and all(np.array_equal(blocks[name], blocks[named[0]]) for name in named):
+        return Parts(named[0], split, len(set(labels[named[0]].tolist())), blocks[named[0]])
     questions = (f"Which column names the episodes: {', '.join(named)}? `episode: {named[0]}`",) if named else ()
-    return Parts(None, split, files, questions)
+    return Parts(None, split, files, np.empty(0, int), questions)
 
 
 def _labels(table: Table, column: Column) -> np.ndarray | None:

@@ -104,7 +104,8 @@ def _missing(q: Quantity, is_input: bool, left: Sequence[Column]) -> str:
     """Ask for the column of a quantity."""
     able = [c for c in left if not c.unit or canonical(c.unit) == canonical(q.unit)]
     near = get_close_matches(q.name.lower(), [c.name.lower() for c in able], n=3, cutoff=0.4)
-    named = [c.name for c in sorted(able, key=lambda c: c.name.lower() not in near)]
+    alike = [c for c in able if c.name.lower() in near or c.name.lower().startswith(q.name.lower())]
+    named = [c.name for c in (*alike, *(c for c in able if c not in alike))]
     unit = f" [{q.unit}]" if canonical(q.unit) != "1" else ""
     which = f"Is it one of {', '.join(named)}?" if named else "No column is left for it."
     if is_input:
