@@ -190,6 +190,23 @@ def test_damaged_mat_files(tmp_path: Path) -> None:
             read_sheet(tmp_path / f"{name}.mat")
 
 
+def test_a_mat_file_with_any_byte_changed_ends_no_process(tmp_path: Path) -> None:
+    """scipy trusts the types in the file and reads outside its memory; `mat_elements` looks at them before."""
+    cell = np.array([1.0, "a"], dtype=object)
+    savemat(tmp_path / "whole.mat", {"t": T[:5], "u": np.array(["ab"]), "b": T[:5] > 2, "s": {"x": T[:5], "c": cell}})
+    content = (tmp_path / "whole.mat").read_bytes()
+    path = tmp_path / "run.mat"
+    refused = 0
+    for i in range(124, len(content), 4):
+        for value in (0, 5, 14, 255):
+            path.write_bytes(content[:i] + bytes([value]) + content[i + 1 :])
+            try:
+                read_sheet(path)
+            except DataError as error:
+                refused += "damaged" in str(error)
+    assert refused > 50
+
+
 def hdf5(path: Path, content: dict[str, Any], units: dict[str, Any] | None = None) -> None:
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:

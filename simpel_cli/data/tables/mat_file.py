@@ -8,6 +8,7 @@ import numpy as np
 
 from simpel_cli.data.tables.arrays import Array, sheet_of
 from simpel_cli.data.tables.mat_cures import cure
+from simpel_cli.data.tables.mat_elements import check_elements
 from simpel_cli.data.tables.optional import library
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError, SimpelError
@@ -56,6 +57,9 @@ def read_mat(path: Path) -> Sheet:
 def _read_old(path: Path, found: _Contents) -> None:
     from scipy.io import loadmat
 
+    raw = path.read_bytes()
+    if 0 not in raw[:4]:  # version 4 begins with small numbers, later ones with a text
+        check_elements(raw)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of variables that are read twice, and of opaque ones
         content = loadmat(path, struct_as_record=True, squeeze_me=False, chars_as_strings=True)
