@@ -313,3 +313,16 @@ def test_hdf5_with_groups(tmp_path: Path) -> None:
     assert (node["time"], node["episode"]) == ("clock/t", "clock/run")
     assert node["columns"] == {"s": "cart/s", "v": "cart/v", "u": "cart/u"}
     assert found.reads
+
+
+def test_fields_are_converted_too(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    columns = table()
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        for name, values in columns.items():
+            file[f"{'clock' if name in ('t', 'run') else 'cart'}/{name}"] = values * (1000 if name in "ts" else 1)
+        file["clock/t"].attrs["unit"] = "ms"
+        file["cart/s"].attrs["unit"] = "mm"
+    found, node = drafted(tmp_path, "run.h5")
+    assert node["computed"] == {"cart_s_in_m": "cart/s*1e-3", "time_s": "clock/t*0.001"}
+    assert found.reads

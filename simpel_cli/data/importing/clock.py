@@ -117,7 +117,7 @@ def _unit(column: Column, usual: float, dt: float | None) -> tuple[str, tuple[st
     whole = bool(np.all(column.values == np.round(column.values)))
     if whole and usual > LONG:
         question = f"Is {column.name} in s or in ms? Its steps are {usual:.6g}, and no unit is given; it is read in s."
-        if column.name.isidentifier():
+        if column.name.replace(".", "_").isidentifier():
             question += f" If it is in ms: `computed: {{time_s: {column.name}/1000}}` and `time: time_s`."
         return "s", (question,)
     return "s", ()

@@ -12,7 +12,7 @@ from simpel_cli.data.estimation.kinematics import Motion, difference_kind
 from simpel_cli.data.importing.clock import Clock, clock_of
 from simpel_cli.data.importing.columns import Column, columns_of, with_jumps
 from simpel_cli.data.importing.episodes import Parts, parts_of
-from simpel_cli.data.importing.match import Matched, match
+from simpel_cli.data.importing.match import Matched, is_usable, match
 from simpel_cli.data.importing.text import Line, yaml_of
 from simpel_cli.data.reader import read
 from simpel_cli.data.recording import Source
@@ -20,7 +20,6 @@ from simpel_cli.data.summary import split_summary
 from simpel_cli.data.tables.locate import locate
 from simpel_cli.data.tables.table import Table, read_table
 from simpel_cli.errors import SimpelError
-from simulators.expression import RESERVED
 
 MOST_COMPARED = 12  # columns, in the search for differences
 IRREGULAR = 0.05  # of the steps
@@ -166,7 +165,7 @@ def _time(clock: Clock, parts: Parts, computed: dict[str, str], asked: list[str]
         return None, clock.column
     if clock.unit == "s":
         return clock.column, ""
-    if not clock.column.isidentifier() or clock.column in RESERVED:
+    if not is_usable(clock.column):
         asked.append(
             f"{clock.column} is in {clock.unit}, and time is read in s. Give the column a name of letters and digits, e.g. "
             f"clock, and write `computed: {{time_s: clock*{clock.factor:g}}}`, `time: time_s`."

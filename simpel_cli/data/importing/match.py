@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
+from simpel_cli.data.computed import COMPOUND
 from simpel_cli.data.importing.columns import Column
 from simpel_cli.data.recording import Source
 from simpel_cli.data.unit_words import ALIASES, canonical
@@ -86,14 +87,13 @@ def _converted(
         if not column.unit or not q.unit or canonical(column.unit) == canonical(q.unit):
             continue
         factor = factor_between(column.unit, q.unit)
-        usable = column.name.isidentifier() and column.name not in RESERVED
-        if factor is None or not usable:
+        if factor is None or not is_usable(column.name):
             del columns[q.name]
             columns[q.name] = None
             how = f"by {factor} in the file" if factor else "in the file, or correct its unit"
             questions.append(f"{q.name} is in {q.unit}, {column.name} in {column.unit}: convert it {how}.")
             continue
-        name = f"{column.name}_in_{re.sub(r'[^A-Za-z0-9]+', '_', q.unit).strip('_')}"
+        name = f"{re.sub(r'[./]', '_', column.name)}_in_{re.sub(r'[^A-Za-z0-9]+', '_', q.unit).strip('_')}"
         computed[name] = f"{column.name}*{factor}"
         columns[q.name] = name
         reasons[q.name] += f", converted from {column.unit} to {q.unit}"
@@ -111,6 +111,11 @@ def _missing(q: Quantity, is_input: bool, left: Sequence[Column]) -> str:
     if is_input:
         return f"Which column is the input {q.name}{unit}? {which} It has to be measured."
     return f"Which column is {q.name}{unit}? {which} null: it was not measured."
+
+
+def is_usable(column: str) -> bool:
+    """Whether a formula can name a column."""
+    return (column.isidentifier() and column not in RESERVED) or COMPOUND.fullmatch(column) is not None
 
 
 def factor_between(given: str, wanted: str) -> str | None:
