@@ -16,7 +16,7 @@ WITH_PREFIX = {
 WITHOUT_PREFIX = {
     "1", "%", "‰", "ppm", "deg", "°", "°C", "°F", "degC", "degF", "celsius", "kelvin", "rpm", "rps", "rev", "U", "min", "h",
     "d", "hr", "hour", "hours", "day", "days", "minute", "minutes", "amp", "amps", "ampere", "amperes", "newton", "newtons",
-    "in", "inch", "ft", "yd", "mi", "mph", "kph", "kmh", "psi", "atm", "mmHg", "Torr", "lb", "lbs", "lbf", "kgf", "oz", "kn",
+    "inch", "ft", "yd", "mi", "mph", "kph", "kmh", "psi", "atm", "mmHg", "Torr", "lb", "lbs", "lbf", "kgf", "oz", "kn",
     "knots", "count", "counts", "tick", "ticks", "step", "steps", "px", "pixel", "pixels", "LSB", "bit", "bits", "dB", "dBm",
     "gal", "g0",
 }  # fmt: skip

@@ -79,6 +79,30 @@ def test_questions_are_shown(folder: Path) -> None:
     assert "reads     not yet: column 's' is missing in other.csv" in result.out
 
 
+BAD = {
+    "run.mat": (b"no MATLAB file" * 20, "run.mat is damaged, cut off or no MATLAB file"),
+    "run.h5": (b"no HDF5 file" * 20, "run.h5 is damaged, cut off or no HDF5 file"),
+    "run.mcap": (b"no MCAP file" * 20, "run.mcap is damaged, cut off or no MCAP file"),
+    "run.db3": (b"no database" * 20, "run.db3 is damaged, cut off or no rosbag2"),
+    "empty.csv": (b"", "empty.csv is empty (0 bytes)"),
+    "words.csv": (b"name,place\na,b\nc,d\n", "words.csv: none of its columns holds numbers"),
+    "twice.csv": (b"t,s,s\n0,1,2\n", "twice.csv has more than one column named s"),
+    "units.csv": (b"t,s [m]\ns,mm\n0,1\n1,2\n", "units.csv: the header 's [m]' gives the unit m, the row below it mm"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_files_that_cannot_be_read(tmp_path: Path, name: str) -> None:
+    for library in ("h5py", "mcap", "mcap_ros2", "rosbags"):
+        pytest.importorskip(library)
+    content, message = BAD[name]
+    (tmp_path / name).write_bytes(content)
+    result = simpel(tmp_path, "import", name)
+    assert (result.code, result.out) == (3, "")
+    assert message in result.err
+    assert "Traceback" not in result.err
+
+
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [

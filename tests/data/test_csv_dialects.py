@@ -153,6 +153,12 @@ def test_what_is_no_unit_stays_in_the_name(text: str) -> None:
     assert header == ((text,), {}, {}, {})
 
 
+def test_what_tells_two_columns_apart_is_no_unit() -> None:
+    names = ("force (L)", "force (R)", "left/m", "left/pos", "x[1]", "x[2]", "flow (in)", "flow (out)")
+    assert header_of(names) == (names, {}, {}, {})
+    assert header_of(["force (L)", "speed (m/s)"]).units == {"force": "L", "speed": "m/s"}
+
+
 def test_names_that_units_would_make_the_same() -> None:
     header = header_of(["x", "x [m]", "left/m", "left/s", "y [m]", "y [mm]"])
     assert header.names == ("x", "x [m]", "left/m", "left/s", "y [m]", "y [mm]")

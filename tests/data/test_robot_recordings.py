@@ -174,7 +174,7 @@ def test_a_bag_is_a_path_and_every_file_of_it_is_named(tmp_path: Path) -> None:
     assert [e.name for e in recording.train] == ["run1", "run2"]
     assert [e.name for e in recording.test] == ["run10"]
     names = [str(file.relative_to(tmp_path)) for file in recording.files]
-    assert names[:2] == ["bags/run1/metadata.yaml", "bags/run1/run1.db3"]
+    assert names[:2] == ["bags/run1/run1.db3", "bags/run1/metadata.yaml"]
     assert len(names) == 6
     assert all(file.is_file() for file in recording.files)
 

@@ -30,7 +30,8 @@ class Header(NamedTuple):
 def header_of(texts: Sequence[str], units_below: Sequence[str] = ()) -> Header:
     """Take the units out of headers.
 
-    A short name that two columns would share is given to neither.
+    A short name that two columns would share is given to neither. What one of them has behind it is no unit if what another one
+    has there is none: force (L) and force (R).
 
     Args:
         texts: the headers, none twice.
@@ -40,6 +41,11 @@ def header_of(texts: Sequence[str], units_below: Sequence[str] = ()) -> Header:
         ValueError: a header and the row of units contradict each other; the message names both.
     """
     parts = [_parts(text) for text in texts]
+    odd = {_stem(text) for text, (_, unit, _) in zip(texts, parts, strict=True) if not unit} - {""}
+    parts = [
+        (text, "", False) if unit and _stem(text) in odd else (short, unit, slash)
+        for text, (short, unit, slash) in zip(texts, parts, strict=True)
+    ]
     shorts = [short for short, _, _ in parts]
     names: list[str] = []
     units: dict[str, str] = {}
@@ -82,6 +88,12 @@ def _parts(text: str) -> tuple[str, str, bool]:
         if is_unit(unit) and unit not in NOT_AFTER_SLASH:
             return match["name"], unit, True
     return text, "", False
+
+
+def _stem(text: str) -> str:
+    """What stands before brackets or a slash; empty: there are none."""
+    match = IN_BRACKETS.fullmatch(text) or AFTER_SLASH.fullmatch(text)
+    return match["name"] if match else ""
 
 
 def _is_number(text: str) -> bool:

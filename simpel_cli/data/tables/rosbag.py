@@ -21,7 +21,8 @@ def read_rosbag(path: Path) -> Sheet:
     """
     library("rosbags", "rosbag", path.name)
     unusable: dict[str, str] = {}
-    parts = tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else ()
+    inside = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else []
+    parts = tuple(sorted(inside, key=lambda file: (file.suffix == ".yaml", file.name)))  # the messages first
     try:
         return sheet_of_topics(path, _messages(path, unusable), unusable, parts)
     except SimpelError:
