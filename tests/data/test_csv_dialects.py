@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data import Measurements, Recording, read
-from simpel_cli.data.tables.csv_header import header_of
+from simpel_cli.data.tables.formats.csv_header import header_of
 from simpel_cli.data.unit_words import is_unit
 from simpel_cli.errors import DataError
 from simulators.model import Declared

@@ -9,8 +9,8 @@ from scipy.io import savemat
 from scipy.sparse import csc_matrix
 
 from simpel_cli.data import Measurements, Recording, read
-from simpel_cli.data.tables import optional
-from simpel_cli.data.tables.mat_cures import cure
+from simpel_cli.data.tables.formats import optional
+from simpel_cli.data.tables.formats.mat_cures import cure
 from simpel_cli.data.tables.read_file import read_sheet
 from simpel_cli.errors import DataError
 from simulators.model import Declared

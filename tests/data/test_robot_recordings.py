@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from simpel_cli.data import Measurements, read
-from simpel_cli.data.tables import optional
+from simpel_cli.data.tables.formats import optional
+from simpel_cli.data.tables.formats.topics import Message, sheet_of_topics
 from simpel_cli.data.tables.read_file import read_sheet
-from simpel_cli.data.tables.topics import Message, sheet_of_topics
 from simpel_cli.errors import DataError
 from simulators.model import Declared
 

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from simpel_cli.data.tables.csv_file import COMMA, Dialect, read_csv
-from simpel_cli.data.tables.csv_header import Header
-from simpel_cli.data.tables.hdf5_file import read_hdf5
-from simpel_cli.data.tables.mat_file import read_mat
-from simpel_cli.data.tables.mcap_file import read_mcap
-from simpel_cli.data.tables.parquet_file import read_parquet
-from simpel_cli.data.tables.rosbag import read_rosbag
+from simpel_cli.data.tables.formats.csv_file import COMMA, Dialect, read_csv
+from simpel_cli.data.tables.formats.csv_header import Header
+from simpel_cli.data.tables.formats.hdf5_file import read_hdf5
+from simpel_cli.data.tables.formats.mat_file import read_mat
+from simpel_cli.data.tables.formats.mcap_file import read_mcap
+from simpel_cli.data.tables.formats.parquet_file import read_parquet
+from simpel_cli.data.tables.formats.rosbag import read_rosbag
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from simpel_cli.data.tables.csv_file import BLANKS, BOTH, COMMA, THOUSANDS, WITH_COMMA, Dialect, line_of
+from simpel_cli.data.tables.formats.csv_file import BLANKS, BOTH, COMMA, THOUSANDS, WITH_COMMA, Dialect, line_of
 from simpel_cli.errors import DataError
 
 

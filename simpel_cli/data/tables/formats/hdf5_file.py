@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.data.tables.arrays import MOST_COLUMNS, Array, sheet_of
-from simpel_cli.data.tables.optional import library
+from simpel_cli.data.tables.formats.arrays import MOST_COLUMNS, Array, sheet_of
+from simpel_cli.data.tables.formats.optional import library
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.data.unit_words import canonical
 from simpel_cli.errors import DataError, SimpelError

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv as arrow_csv
 
-from simpel_cli.data.tables.csv_header import Header, are_units, header_of
+from simpel_cli.data.tables.formats.csv_header import Header, are_units, header_of
 from simpel_cli.errors import DataError
 
 BLANKS = " "  # any number of blanks and tabs

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.data.tables.arrays import Array, sheet_of
-from simpel_cli.data.tables.mat_cures import cure
-from simpel_cli.data.tables.mat_elements import check_elements
-from simpel_cli.data.tables.optional import library
+from simpel_cli.data.tables.formats.arrays import Array, sheet_of
+from simpel_cli.data.tables.formats.mat_cures import cure
+from simpel_cli.data.tables.formats.mat_elements import check_elements
+from simpel_cli.data.tables.formats.optional import library
 from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError, SimpelError
 

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from simpel_cli.data.tables.optional import library
+from simpel_cli.data.tables.formats.optional import library
+from simpel_cli.data.tables.formats.topics import Message, sheet_of_topics
 from simpel_cli.data.tables.sheet import Sheet
-from simpel_cli.data.tables.topics import Message, sheet_of_topics
 from simpel_cli.errors import DataError, SimpelError
 
 
