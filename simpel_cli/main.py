@@ -14,6 +14,7 @@ from simpel_cli.commands.example import example
 from simpel_cli.commands.exit_codes import run
 from simpel_cli.commands.export import export
 from simpel_cli.commands.fit import fit
+from simpel_cli.commands.import_ import import_
 from simpel_cli.commands.report import report
 from simpel_cli.commands.rl_offline import rl_offline
 from simpel_cli.commands.rl_online import rl_online
@@ -54,10 +55,10 @@ def _simpel(
 
 
 for verb in (
-    fit, evaluate, discover, rl_offline, rl_online, sweep, report, export, sims, effects, example, doctor, simulate,
+    fit, evaluate, discover, rl_offline, rl_online, sweep, report, export, import_, sims, effects, example, doctor, simulate,
     schema,
 ):  # fmt: skip
-    app.command(verb.__name__.replace("_", "-"))(verb)
+    app.command(verb.__name__.strip("_").replace("_", "-"))(verb)  # `import_`: import is a word of Python's
 
 
 def main() -> None:

@@ -19,7 +19,9 @@ class Measurements:
     """Files of measurements and how they map onto a simulator.
 
     Args:
-        path: a .parquet or .csv file, or a list of them with the same columns (an empty one: nothing was measured);
+        path: a file (.parquet, .csv, .mat, .h5, .hdf5, .mcap, .db3, or the folder of a rosbag2), a pattern of files with `*`,
+            `**`, `?` and `{name}`, whose text becomes a column, e.g. `runs/*/mass{mass}_*.csv`, or a list of these with the
+            same columns (an empty one: nothing was measured);
             relative paths are tried against the config file's folder, then the working one. An episode never runs on
             from one file into the next: where their names are the same in two files, or none are given, they are called
             by the file's name.

@@ -16,6 +16,7 @@ from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
 from simpel_cli.data.split import PARTS, assign
+from simpel_cli.data.tables.column_names import with_short_names
 from simpel_cli.data.tables.locate import by_file, locate
 from simpel_cli.data.tables.table import read_table
 from simpel_cli.data.time_gaps import cut_at_gaps
@@ -53,13 +54,15 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
             f"data.between_rows.{name}: linear, but the next value of an input is not known in layout 'transitions', whose "
             "rows do not follow each other. Store trajectories, or set it to held."
         )
-    paths = tuple(locate(path, base) for path in config.paths)
-    table = with_computed(read_table(paths), config.computed)
+    found = [file for path in config.paths for file in locate(path, base)]
+    table = read_table(tuple(file.path for file in found), [file.named for file in found])
+    config = with_short_names(config, table, tuple(q.name for q in model.outputs))
+    table = with_computed(table, config.computed)
     mapping = map_columns(config, model, table)
     dynamic = bool(model.states) and config.layout == "trajectories"
 
     units, cards = check_units(config, table, mapping.columns, quantities)
-    report = [units]
+    report = [Check("files", True, "; ".join(table.notes)), units] if table.notes else [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping))
@@ -84,7 +87,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
         estimated=mapping.unmeasured,
         checks=tuple(report),
-        files=(*paths, *cards),
+        files=(*table.files, *cards),
         derived=tuple(name for name in computed if name in mapping.columns),
     )
 

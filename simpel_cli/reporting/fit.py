@@ -63,8 +63,9 @@ def describe_data(terminal: Terminal, recording: Recording, used: str) -> None:
     if not recording.files:
         terminal.line("no measurements: the posterior is the prior", "data")
         return
+    more = sum(file.suffix != ".yaml" for file in recording.files[1:])  # cards only describe
     terminal.line(
-        f"{recording.files[0]}   {used}   checks {len(recording.checks) - len(failed)} ok"
+        f"{recording.files[0]}{f' and {more} more' if more else ''}   {used}   checks {len(recording.checks) - len(failed)} ok"
         + (f", {len(failed)} with warnings" if failed else ""),
         "data",
     )

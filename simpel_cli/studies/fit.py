@@ -113,9 +113,17 @@ def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> No
     """Compare the measurements with what a run's manifest says that it was trained on.
 
     Raises:
-        DataError: a file is another one now, so that the run cannot be repeated or gone on with.
+        DataError: a file is another one now, or there are more or fewer of them (of a pattern in `data.path`), so that the run
+            cannot be repeated or gone on with.
     """
     known = record.get("inputs_sha256") or {}
+    new = [file for file in files if str(file) not in known and file.suffix != ".yaml"]
+    gone = [name for name in known if not Path(name).exists()]
+    if (new or gone) and any(
+        str(file) in known for file in files
+    ):  # none is known where all were moved to another folder
+        what = f"{new[0]} is new" if new else f"{gone[0]} is gone"
+        raise DataError(f"{what} since the run was started. Have the same files in data.path again, or fit again.")
     for file in files:
         if known.get(str(file), digest := sha256(file)) != digest:
             raise DataError(

@@ -21,8 +21,8 @@ from safetensors.numpy import load_file
 from simpel_cli.runs.manifest import sha256
 
 VERBS = [
-    "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "sims", "effects", "example",
-    "doctor", "simulate", "schema",
+    "fit", "evaluate", "discover", "rl-offline", "rl-online", "sweep", "report", "export", "import", "sims", "effects",
+    "example", "doctor", "simulate", "schema",
 ]  # fmt: skip
 SCHEMA = [
     ("run", pa.string()), ("command", pa.string()), ("experiment", pa.string()), ("method", pa.string()),

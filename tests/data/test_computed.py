@@ -31,6 +31,27 @@ def test_values_of_all_files_and_of_columns_computed_before(table: Table) -> Non
     assert "v" not in table.columns
 
 
+def test_names_of_fields(tmp_path: Path) -> None:
+    columns = {
+        "imu.gyro.x": [1.0, 2.0],
+        "imu.gyro": [3.0, 4.0],
+        "imu_gyro": [5.0, 6.0],
+        "car/v": [8.0, 9.0],
+        "v": [2.0, 3.0],
+    }
+    pd.DataFrame(columns).to_parquet(tmp_path / "a.parquet")
+    table = read_table((tmp_path / "a.parquet",))
+    found = with_computed(table, {"y": "imu.gyro.x/imu.gyro + 2.5*imu_gyro", "z": "car/v/v", "w": "sqrt(imu.gyro.x)"})
+    np.testing.assert_allclose(found.numbers("y"), [1 / 3 + 12.5, 2 / 4 + 15])
+    np.testing.assert_allclose(found.numbers("z"), [4, 3])
+    np.testing.assert_allclose(found.numbers("w"), [1, 2**0.5])
+    pd.DataFrame(columns | {"car": [1.0, 1.0]}).to_parquet(tmp_path / "b.parquet")
+    table = read_table((tmp_path / "b.parquet",))
+    with pytest.raises(ConfigError, match=r"data\.computed\.z: car/v may be that column or a quotient.*`car / v`"):
+        with_computed(table, {"z": "car/v"})
+    np.testing.assert_allclose(with_computed(table, {"z": "car / v"}).numbers("z"), [0.5, 1 / 3])
+
+
 @pytest.mark.parametrize(
     ("formulas", "error", "words"),
     [

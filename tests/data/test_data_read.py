@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from simpel_cli.data import Measurements, Recording, read, transitions
-from simpel_cli.data.tables.sheet import read_sheet
+from simpel_cli.data.tables.read_file import read_sheet
 from simpel_cli.errors import ConfigError, DataError, SimpelError
 from simulators.model import Declared, Model
 
@@ -166,10 +166,19 @@ def test_static_model_takes_every_row(tmp_path: Path) -> None:
         ("", ["run.csv is empty"]),
         ("run,t,s,v,volts\n", ["has a header (run, t, s, v, volts) but no rows"]),
         (
-            "run;t;s;v;volts\n0;0,1;1,2;3,4;5,6\n",
-            ["decimal comma: write 0.1", "read_csv('run.csv', sep=';', decimal=',')"],
+            "run;t;s;v;volts\n0;0,1;1,2;3.4;5,6\n",
+            ["line 2 has '0,1'", "Other numbers of the file have a decimal point"],
         ),
-        ("run t s v volts\n0 0,1 1,2 3,4 5,6\n", ["line 2 has '0,1'", "write 0.1", "sep='\\\\s+', decimal=','"]),
+        (
+            "run;t;s;v;volts\n0;0;1,234;3;5\n",
+            ["may be 1.234 or 1234", "read_csv('run.csv', sep=';', decimal=',')", "the same with thousands=','"],
+        ),
+        ("run t s v volts\n0 0 1,234 3 5\n", ["line 2 has '1,234'", "sep='\\\\s+', decimal=','"]),
+        (
+            "run;t;s;v;volts\n0;0,1;1.234,5;3;5\n",
+            ["line 2 has '1.234,5'", "decimal comma, without separators of thousands"],
+        ),
+        ("0,5;1,5\n0;1\n", ["run.csv starts with numbers"]),
         ("run,t,s;v,volts\n0,0,1;1,0\n", ["read in two ways", "a comma (4 columns) or a semicolon (2 columns)"]),
         (
             "run t [s] s v volts\n0 0.1 1 1 0\n",
@@ -207,7 +216,7 @@ def test_file_is_missing_or_of_another_kind(tmp_path: Path) -> None:
     assert str(tmp_path) in str(error.value)
     assert str(Path.cwd()) in str(error.value)
     (tmp_path / "run.xlsx").write_text("x")
-    with pytest.raises(DataError, match=r"'.xlsx', only .parquet or .csv"):
+    with pytest.raises(DataError, match=r"'.xlsx', only .parquet, .csv, "):
         read(Measurements("run.xlsx"), CART, tmp_path, 0)
 
 

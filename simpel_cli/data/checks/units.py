@@ -1,7 +1,6 @@
 """Units of columns against units of the simulator, and angles."""
 
 import math
-import re
 from pathlib import Path
 
 import yaml
@@ -9,15 +8,9 @@ import yaml
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Check
 from simpel_cli.data.tables.table import Table
+from simpel_cli.data.unit_words import canonical
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
-
-ALIASES = {
-    "-": "1", "none": "1", "dimensionless": "1",
-    "radian": "rad", "radians": "rad", "degree": "deg", "degrees": "deg", "°": "deg",
-    "sec": "s", "second": "s", "seconds": "s", "meter": "m", "metre": "m", "meters": "m", "metres": "m",
-    "volt": "V", "volts": "V",
-}  # fmt: skip
 
 
 def read_card(path: Path) -> tuple[dict[str, str], Path | None]:
@@ -63,7 +56,7 @@ def check_units(
         of_card, card = read_card(sheet.path)
         cards |= {card: None} if card is not None else {}
         of_column = of_card | sheet.units
-        if config.time is not None and _canonical(of_column.get(config.time) or "s") != "s":
+        if config.time is not None and canonical(of_column.get(config.time) or "s") != "s":
             raise DataError(
                 f"column '{config.time}' of {sheet.path.name} is in {of_column[config.time]}, but time is read in s."
             )
@@ -73,7 +66,7 @@ def check_units(
             if column is None or not unit or not quantity.unit:  # one of them is not stated
                 continue
             compared.add(quantity.name)
-            if _canonical(unit) != _canonical(quantity.unit):
+            if canonical(unit) != canonical(quantity.unit):
                 raise DataError(_mismatch(sheet.path, column, unit, quantity))
     return Check("units", True, _declared(len(compared), len(measured))), tuple(cards)
 
@@ -82,7 +75,7 @@ def period(quantity: Quantity) -> float | None:
     """Length of a full turn in the quantity's unit, None where it is not periodic."""
     if not quantity.periodic:
         return None
-    return 360.0 if _canonical(quantity.unit) == "deg" else 2 * math.pi
+    return 360.0 if canonical(quantity.unit) == "deg" else 2 * math.pi
 
 
 def _declared(compared: int, measured: int) -> str:
@@ -97,15 +90,8 @@ def _mismatch(path: Path, column: str, unit: str, quantity: Quantity) -> str:
         f"unit of column '{column}' in {path.name} is {unit}, but the simulator has '{quantity.name}' "
         f"in {quantity.unit}."
     )
-    given, wanted = _canonical(unit), _canonical(quantity.unit)
+    given, wanted = canonical(unit), canonical(quantity.unit)
     for turn, other, factor in (("deg", "rad", "pi/180"), ("rad", "deg", "180/pi")):
         if given.replace(turn, other, 1) == wanted and turn in given:
             return f"{message} Multiply the column by {factor}, so that it is in {quantity.unit}."
     return f"{message} Convert the column, or correct data.units.{quantity.name} if the unit is declared wrongly."
-
-
-def _canonical(unit: str) -> str:
-    """One spelling per unit: `N*m/V` = `N m / V`, `m/s^2` = `m/s²`, `degrees` = `deg`; order stays as written."""
-    text = unit.strip().replace("²", "2").replace("³", "3").replace("**", "").replace("^", "")
-    words = [word for word in re.split(r"([/])|[\s*·]+", text) if word]
-    return " ".join(ALIASES.get(word, ALIASES.get(word.lower(), word)) for word in words)

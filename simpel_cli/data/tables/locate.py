@@ -1,30 +1,41 @@
 """Where the files of `data.path` lie, and which of them are for testing."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
 from simpel_cli.data.config import Measurements
+from simpel_cli.data.tables.pattern import Found, is_bag, is_pattern, matches, nearest
 from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import ConfigError, DataError, did_you_mean
 
 BY_FILE = "data.split.test_files"  # column that `by_file` adds to a table
 
 
-def locate(path: str, base: Path) -> Path:
-    """Find the file: an absolute path, else against `base` (the config file's folder), else the working directory.
+def locate(path: str, base: Path) -> list[Found]:
+    """Find the file, or the files of a pattern.
+
+    Args:
+        path: absolute, else tried against `base`, then against the working directory.
+        base: the config file's folder.
 
     Raises:
+        ConfigError: the pattern can be read in two ways.
         DataError: nothing is there; the message lists the places that were tried.
     """
     tried = _places(path, base)
     for candidate in tried:
-        if candidate.is_file():
-            return candidate.resolve()
-    folder = " It is a folder, not a file." if any(c.is_dir() for c in tried) else ""
+        if found := _at(candidate):
+            return found
+    if is_pattern(path):
+        raise DataError(_no_match(path, tried))
+    folder = ""
+    if any(c.is_dir() for c in tried):
+        folder = f" It is a folder, not a file: for the files in it write '{path.rstrip('/')}/*.csv'."
     places = ", ".join(dict.fromkeys(str(c.resolve()) for c in tried))
     raise DataError(f"data.path: '{path}' was not found.{folder} Tried: {places}.")
 
@@ -40,7 +51,10 @@ def absolute(data: Mapping[str, Any], base: Path) -> dict[str, Any]:
     def found(path: Any) -> Any:
         if not isinstance(path, str):
             return path
-        return next((str(p.resolve()) for p in _places(path, base) if p.is_file()), path)
+        place = next((p for p in _places(path, base) if _at(p)), None)
+        if place is None:
+            return path
+        return str(place.resolve()) if _is_one(place) else os.path.abspath(place)
 
     def all_found(paths: Any) -> Any:
         return [found(path) for path in paths] if isinstance(paths, list | tuple) else found(paths)
@@ -76,9 +90,9 @@ def by_file(config: Measurements, table: Table, base: Path) -> tuple[Measurement
     part = np.full(len(table.sheets), "train", dtype="<U5")
     for entry in config.split["test_files"]:
         hits = [i for i, sheet in enumerate(table.sheets) if _names(entry, sheet.path, base)]
-        if len(hits) != 1:
+        if len(hits) != 1 and not (hits and is_pattern(entry)):
             raise ConfigError(_not_one(entry, table, len(hits)))
-        part[hits[0]] = "test"
+        part[hits] = "test"
     if (part == "test").all():
         raise ConfigError(
             f"data.split.test_files: {', '.join(config.split['test_files'])} are all the files of data.path, so that "
@@ -92,10 +106,36 @@ def _places(path: str, base: Path) -> list[Path]:
     return [given] if given.is_absolute() else [base / given, Path.cwd() / given]
 
 
+def _at(place: Path) -> list[Found]:
+    """The file or files at a place; a file of that very name goes before what it would stand for as a pattern."""
+    if _is_one(place):
+        return [Found(place.resolve(), {})]
+    return matches(Path(os.path.abspath(place))) if is_pattern(str(place)) else []
+
+
+def _is_one(place: Path) -> bool:
+    return place.is_file() or is_bag(place)
+
+
+def _no_match(path: str, tried: list[Path]) -> str:
+    looked = {}
+    for place in tried:
+        folder, names = nearest(Path(os.path.abspath(place)))
+        looked[str(folder)] = f"{folder} (nearest there: {', '.join(names) or 'it has no files'})"
+    return (
+        f"data.path: no file matches '{path}'. Looked in: {'; '.join(looked.values())}. * stands for any text but a slash, ** "
+        "for folders, ? for one letter, {name} for text that becomes a column."
+    )
+
+
 def _names(entry: str, path: Path, base: Path) -> bool:
-    """Whether an entry means the file: as a path, or as the end of its path."""
-    if any(place.is_file() and place.resolve() == path for place in _places(entry, base)):
+    """Whether an entry means the file: as a path, or as the end of its path, with wildcards or without."""
+    if any(_is_one(place) and place.resolve() == path for place in _places(entry, base)):
         return True
+    if is_pattern(entry):
+        return PurePath(path).match(entry) or any(
+            found.path == path for place in _places(entry, base) for found in _at(place)
+        )
     parts = Path(entry).parts
     return path.parts[-len(parts) :] == parts
 

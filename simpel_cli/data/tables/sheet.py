@@ -1,7 +1,5 @@
-"""A Parquet or CSV file as named columns, with messages that a person can act on."""
+"""A file as named columns, with messages that a person can act on."""
 
-import re
-from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +7,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pyarrow import parquet
 
-from simpel_cli.data.tables.csv_file import BLANKS, Dialect, line_of, read_csv
+from simpel_cli.data.tables.formats.csv_file import BLANKS, BOTH, COMMA, THOUSANDS, WITH_COMMA, Dialect, line_of
 from simpel_cli.errors import DataError
-
-DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 
 
 @dataclass(frozen=True)
@@ -24,14 +19,22 @@ class Sheet:
     Args:
         path: the file.
         columns: name -> Arrow column, all of the same length.
-        units: name -> unit, from Parquet field metadata.
+        units: name -> unit, as the file gives it.
         dialect: of a CSV file.
+        full: other names of columns -> name, e.g. the header `phi [rad]` of the column `phi`.
+        unusable: names of what is no column, though one may look for it -> why, and what to do.
+        notes: how the file was read, where there is something to say.
+        parts: the files that it is made of; empty: the one at `path`.
     """
 
     path: Path
     columns: dict[str, pa.ChunkedArray]
     units: dict[str, str] = field(default_factory=dict)
     dialect: Dialect = Dialect()
+    full: dict[str, str] = field(default_factory=dict)
+    unusable: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    parts: tuple[Path, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -48,6 +51,8 @@ class Sheet:
         if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
             # numbers with blanks around them are common in hand-made files and are no fault
             column = pc.utf8_trim_whitespace(column)
+            if self.dialect.decimal == COMMA:
+                column = pc.replace_substring(column, ",", ".")
         try:
             numbers = pc.cast(column, pa.float64(), safe=False)
         except pa.ArrowException as error:
@@ -66,7 +71,7 @@ class Sheet:
         return np.array(pc.utf8_trim_whitespace(texts).to_pylist(), dtype=str)
 
     def place(self, index: int) -> str:
-        """Name a row as a person finds it: the line of a CSV file, the row of a Parquet file counted from 0."""
+        """Name a row as a person finds it: the line of a CSV file, the row of another counted from 0."""
         if self.path.suffix.lower() != ".csv":
             return f"row {index} (counted from 0)"
         return f"line {line_of(self.path, self.dialect, index)}"
@@ -74,69 +79,35 @@ class Sheet:
     def _not_a_number(self, name: str, column: pa.ChunkedArray) -> DataError:
         if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
             return DataError(f"column '{name}' of {self.path.name} holds {column.type}, not numbers.")
-        index, text = next((i, t) for i, t in enumerate(column.to_pylist()) if t is not None and not _is_number(t))
-        cure = "Write numbers with a decimal point, and leave a missing one empty."
-        if DECIMAL_COMMA.fullmatch(text):
-            cure = f"It looks like a decimal comma: write {text.replace(',', '.')}."
-            if self.dialect.separator != ",":
-                separator = r"\s+" if self.dialect.separator == BLANKS else self.dialect.separator
-                cure += (
-                    f" All at once: pandas.read_csv('{self.path.name}', sep={separator!r}, decimal=',')"
-                    f".to_csv(..., index=False)"
-                )
+        texts = pc.utf8_trim_whitespace(self.columns[name]).to_pylist()
+        index, text = next(
+            (i, t) for i, (t, n) in enumerate(zip(texts, column.to_pylist(), strict=True)) if _is_text(n)
+        )
         return DataError(
             f"column '{name}' of {self.path.name} should hold numbers, but {self.place(index)} has {text[:40]!r}. "
-            f"{cure}"
+            f"{self._cure(index, text)}"
         )
 
-
-def read_sheet(path: Path) -> Sheet:
-    """Read a .parquet or .csv file.
-
-    Raises:
-        DataError: the extension is neither, or the file is empty, damaged, has no rows, repeats a name or is written
-            in another CSV dialect.
-    """
-    readers = {".parquet": _read_parquet, ".csv": _read_csv}
-    if path.suffix.lower() not in readers:
-        raise DataError(f"data.path: {path.name} ends in '{path.suffix}', only .parquet or .csv can be read.")
-    if path.stat().st_size == 0:
-        raise DataError(f"{path.name} is empty (0 bytes).")
-    sheet = readers[path.suffix.lower()](path)
-    if not sheet.columns:
-        raise DataError(f"{path.name} has no named columns.")
-    if len(sheet) == 0:
-        raise DataError(f"{path.name} has a header ({', '.join(sheet.columns)}) but no rows.")
-    return sheet
-
-
-def _read_parquet(path: Path) -> Sheet:
-    try:
-        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            content = file.read()
-        content.validate(full=True)  # of texts, that they are some
-        names = content.column_names
-        units = {f.name: f.metadata[b"unit"].decode() for f in content.schema if f.metadata and b"unit" in f.metadata}
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path.name} is damaged, cut off or no Parquet file. Copy or write it again.") from error
-    _refuse_repeated(path, names)
-    return Sheet(path, {name: _plain(content[name]) for name in content.column_names}, units)
-
-
-def _read_csv(path: Path) -> Sheet:
-    columns, dialect = read_csv(path)
-    return Sheet(path, columns, dialect=dialect)
-
-
-def _refuse_repeated(path: Path, names: list[str]) -> None:
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        raise DataError(f"{path.name} has more than one column named {', '.join(repeated)}. Give each its own name.")
-
-
-def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Undo dictionary encoding, which pandas writes for categories."""
-    return pc.cast(column, column.type.value_type) if pa.types.is_dictionary(column.type) else column
+    def _cure(self, index: int, text: str) -> str:
+        """Say what to do about a text that is no number."""
+        if WITH_COMMA.fullmatch(text) and self.dialect.decimal == BOTH:
+            return (
+                "Other numbers of the file have a decimal point, so that this comma may be a decimal comma or separate "
+                "thousands. Write all numbers with a decimal point."
+            )
+        if WITH_COMMA.fullmatch(text) and self.dialect.decimal == THOUSANDS:
+            separator = r"\s+" if self.dialect.separator == BLANKS else self.dialect.separator
+            return (
+                f"It may be {text.replace(',', '.')} or {text.replace(',', '')}: every comma of the file stands before three "
+                f"digits. If it is a decimal comma: pandas.read_csv('{self.path.name}', sep={separator!r}, decimal=',')"
+                f".to_csv(..., index=False); if it separates thousands: the same with thousands=','."
+            )
+        if WITH_COMMA.fullmatch(text):
+            return f"It looks like a decimal comma: write {text.replace(',', '.')}."
+        if self.dialect.decimal == COMMA:
+            return "Write numbers with a decimal comma, without separators of thousands, and leave a missing one empty."
+        hint = " A row of units is read as one if every entry is a known unit or empty." if index == 0 else ""
+        return f"Write numbers with a decimal point, and leave a missing one empty.{hint}"
 
 
 def _seconds(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -145,9 +116,10 @@ def _seconds(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return pc.multiply(pc.cast(pc.subtract(stamps, pc.min(stamps)), pa.float64()), 1e-9)
 
 
-def _is_number(text: str) -> bool:
+def _is_text(entry: str | None) -> bool:
+    """Whether an entry is there and no number."""
     try:
-        pc.cast(pa.scalar(text), pa.float64())
+        pc.cast(pa.scalar(entry, pa.string()), pa.float64())
     except pa.ArrowException:
-        return False
-    return True
+        return True
+    return False

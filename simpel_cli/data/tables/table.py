@@ -1,13 +1,19 @@
 """One file or several with the same columns, read as one table: the rows of a file follow those of the file before."""
 
+import re
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
-from simpel_cli.data.tables.sheet import Sheet, read_sheet
+from simpel_cli.data.tables.read_file import read_sheet
+from simpel_cli.data.tables.sheet import Sheet
 from simpel_cli.errors import DataError, did_you_mean
+
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,30 @@ class Table:
     def name(self) -> str:
         """File names, for messages."""
         return ", ".join(sheet.path.name for sheet in self.sheets)
+
+    @property
+    def full(self) -> dict[str, str]:
+        """Other names of columns -> name, see `Sheet`."""
+        return {text: name for sheet in self.sheets for text, name in sheet.full.items()}
+
+    @property
+    def unusable(self) -> dict[str, str]:
+        """Names of what is no column in one of the files -> why, see `Sheet`."""
+        return {name: why for sheet in self.sheets for name, why in sheet.unusable.items()}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that was read."""
+        return tuple(part for sheet in self.sheets for part in sheet.parts or (sheet.path,))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How the files were read, where there is something to say."""
+        names: dict[str, list[str]] = {}
+        for sheet in self.sheets:
+            for note in sheet.notes:
+                names.setdefault(note, []).append(sheet.path.name)
+        return tuple(f"{n[0] if len(n) == 1 else f'{len(n)} files'}: {note}" for note, n in names.items())
 
     @property
     def file(self) -> np.ndarray:
@@ -74,13 +104,20 @@ class Table:
 
     def missing(self, column: str, cure: str) -> DataError:
         """Error for a column that the files do not have."""
-        hint = did_you_mean(column, list(self.columns))
+        for name, why in self.unusable.items():
+            if column == name or column.startswith(f"{name}."):  # a field of a struct that cannot be read
+                return DataError(f"{why}\n{cure}")
+        hint = did_you_mean(column, [*self.columns, *self.full])
         has = ", ".join(self.columns)
         return DataError(f"column '{column}' is missing in {self.name} (it has: {has}).{hint}\n{cure}")
 
 
-def read_table(paths: tuple[Path, ...]) -> Table:
-    """Read .parquet or .csv files.
+def read_table(paths: tuple[Path, ...], named: Sequence[Mapping[str, str]] = ()) -> Table:
+    """Read files.
+
+    Args:
+        paths: of the files.
+        named: of each file, column -> text that its name gives; numbers if all files give numbers.
 
     Raises:
         DataError: what `read_sheet` refuses, a file that is named twice, or a column that one of the files lacks.
@@ -88,7 +125,7 @@ def read_table(paths: tuple[Path, ...]) -> Table:
     twice = [path.name for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DataError(f"data.path: {twice[0]} is named twice. Name each file once.")
-    sheets = tuple(read_sheet(path) for path in paths)
+    sheets = _with_names(tuple(read_sheet(path) for path in paths), named)
     for sheet in sheets:
         for other in sheets:
             lacking = [name for name in other.columns if name not in sheet.columns]
@@ -99,3 +136,26 @@ def read_table(paths: tuple[Path, ...]) -> Table:
                     "The files of data.path are read as one and need the same columns: rename, add or remove it."
                 )
     return Table(sheets)
+
+
+def _with_names(sheets: tuple[Sheet, ...], named: Sequence[Mapping[str, str]]) -> tuple[Sheet, ...]:
+    """Sheets with the columns that the names of their files give."""
+    numeric = {
+        name: all(NUMBER.fullmatch(texts[name]) for texts in named if name in texts)
+        for texts in named
+        for name in texts
+    }
+    done = []
+    for sheet, texts in zip(sheets, named or [{} for _ in sheets], strict=True):
+        for name in texts:
+            if name in sheet.columns:
+                raise DataError(
+                    f"data.path: {{{name}}} makes a column '{name}', but {sheet.path.name} has one already. Give it another "
+                    "name in the pattern, or write * there."
+                )
+        added = {
+            name: pa.chunked_array([pa.array([float(text) if numeric[name] else text] * len(sheet))])
+            for name, text in texts.items()
+        }
+        done.append(replace(sheet, columns=sheet.columns | added) if added else sheet)
+    return tuple(done)

@@ -1,4 +1,4 @@
-"""A CSV file as columns of text: separator and comment lines are found out where there is one way to read them."""
+"""A CSV file as columns of text: separator, comments, units, decimal commas are found out where there is one way to read."""
 
 import csv
 import io
@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from pyarrow import csv as arrow_csv
 
+from simpel_cli.data.tables.formats.csv_header import Header, are_units, header_of
 from simpel_cli.errors import DataError
 
 BLANKS = " "  # any number of blanks and tabs
 SEPARATORS = {",": "a comma", ";": "a semicolon", "\t": "a tab", BLANKS: "blanks"}
 COMMENT = re.compile(r"^[ \t]*#", re.M)
 SAMPLE = 50  # rows that decide on the separator
+POINT, COMMA, BOTH, THOUSANDS = ".", ",", "both", "thousands"  # what numbers are written with; the last two: in doubt
+WITH_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+WITH_POINT = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
+IN_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")  # 1,234 may be 1.234 or 1234; 0,123 is no thousand
 
 
 class Dialect(NamedTuple):
@@ -26,18 +32,25 @@ class Dialect(NamedTuple):
         separator: one of `SEPARATORS`.
         names: of the columns, where a comment line above the first row gives them; None: the first line does.
         comments: whether there are lines that begin with #.
+        units: of the columns, where a row of their own gives them.
+        units_line: whether that row stands between header and numbers, and is no comment.
+        decimal: what the numbers are written with: `POINT`, `COMMA`, or in doubt `BOTH` or `THOUSANDS`.
     """
 
     separator: str = ","
     names: tuple[str, ...] | None = None
     comments: bool = False
+    units: tuple[str, ...] = ()
+    units_line: bool = False
+    decimal: str = POINT
 
 
-def read_csv(path: Path) -> tuple[dict[str, pa.ChunkedArray], Dialect]:
-    """Read a CSV file: name -> column of text.
+def read_csv(path: Path) -> tuple[dict[str, pa.ChunkedArray], Header, Dialect]:
+    """Read a CSV file: name -> column of text, what the header says, how it is written.
 
     Raises:
-        DataError: it is not UTF-8, can be read in two ways, has no header, or a row with too many or too few entries.
+        DataError: it is not UTF-8, can be read in two ways, has no header, a row with too many or too few entries, or a unit
+            in its header that the row of units contradicts.
     """
     try:
         content = path.read_text(encoding="utf-8-sig")
@@ -47,19 +60,62 @@ def read_csv(path: Path) -> tuple[dict[str, pa.ChunkedArray], Dialect]:
     # Everything is read as text, the header too: Arrow's own guess of types fails far from the entry that is at fault.
     table = _parse(path, _plain(content, dialect), dialect)
     if dialect.names is not None and len(dialect.names) == len(table.columns):
-        return {name: column for name, column in zip(dialect.names, table.columns, strict=True) if name}, dialect
+        names, columns = list(dialect.names), list(table.columns)
+    else:
+        names, columns = _below_header(path, table, dialect)
+        dialect = dialect._replace(units=())
+        if below := _units_below(columns):
+            dialect = dialect._replace(units=below, units_line=True)
+            columns = [column[1:] for column in columns]
+    try:
+        header = header_of(names, dialect.units)
+    except ValueError as error:
+        raise DataError(f"{path.name}: {error}. Correct one of them, or leave it empty.") from error
+    named = {name: column for name, column in zip(header.names, columns, strict=True) if name}
+    return named, header, dialect._replace(decimal=_decimal(list(named.values()), dialect.separator))
+
+
+def _below_header(path: Path, table: pa.Table, dialect: Dialect) -> tuple[list[str], list[pa.ChunkedArray]]:
+    """Names in the first row, and the columns below them."""
     names = [str(column[0].as_py() or "").strip() for column in table.columns]
-    if names and all(map(_is_number, names)):
+    if names and all(_is_number(name, dialect.separator) for name in names):
         raise DataError(f"{path.name} starts with numbers. Its first line must name the columns, e.g. t,phi,u.")
     repeated = [name for i, name in enumerate(names) if name and name in names[:i]]
     if repeated:
         raise DataError(f"{path.name} has more than one column named {', '.join(repeated)}. Give each its own name.")
-    return {name: column[1:] for name, column in zip(names, table.columns, strict=True) if name}, dialect
+    return names, [column[1:] for column in table.columns]
+
+
+def _units_below(columns: list[pa.ChunkedArray]) -> tuple[str, ...]:
+    """The row of units below the header; empty: there is none."""
+    if not columns or len(columns[0]) < 2:
+        return ()
+    texts = [str(column[0].as_py() or "").strip() for column in columns]
+    rests = [[str(v).strip() for v in column[1 : SAMPLE + 1].to_pylist() if v is not None] for column in columns]
+    numeric = [bool(rest) and all(_is_number(v, ";") for v in rest) for rest in rests]
+    return tuple(texts) if are_units(texts, numeric) else ()
+
+
+def _decimal(columns: list[pa.ChunkedArray], separator: str) -> str:
+    """What the numbers of a file are written with."""
+    if separator == ",":
+        return POINT  # 0,5 would be two entries; in quotes it is refused
+    trimmed = [pc.utf8_trim_whitespace(column) for column in columns]
+    with_comma = [column.filter(_matches(column, WITH_COMMA)) for column in trimmed]
+    if not any(map(len, with_comma)):
+        return POINT
+    if any(pc.any(_matches(column, WITH_POINT)).as_py() for column in trimmed):
+        return BOTH
+    return THOUSANDS if all(pc.all(_matches(c, IN_THOUSANDS)).as_py() for c in with_comma if len(c)) else COMMA
+
+
+def _matches(column: pa.ChunkedArray, pattern: re.Pattern[str]) -> pa.ChunkedArray:
+    return pc.fill_null(pc.match_substring_regex(column, f"^(?:{pattern.pattern})$"), False)
 
 
 def line_of(path: Path, dialect: Dialect, index: int) -> int:
     """Line of a file, counted from 1, on which the record of a row (from 0) ends."""
-    header = dialect.names is None
+    header = (dialect.names is None) + dialect.units_line
     line = index + 1 + header
     with suppress(csv.Error), path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         reader = csv.reader(file, delimiter=dialect.separator)
@@ -76,12 +132,12 @@ def line_of(path: Path, dialect: Dialect, index: int) -> int:
 def _dialect(path: Path, content: str) -> Dialect:
     comments = COMMENT.search(content) is not None
     rows: list[str] = []
-    remark = ""  # the last one above the first row
+    remarks: list[str] = []  # above the first row
     for line in filter(str.strip, io.StringIO(content)):
         if not line.lstrip().startswith("#"):
             rows.append(line.rstrip("\n"))
         elif not rows:
-            remark = line
+            remarks.append(line)
         if len(rows) == SAMPLE:
             break
     if not rows:
@@ -89,15 +145,21 @@ def _dialect(path: Path, content: str) -> Dialect:
             raise DataError(f"{path.name} has comment lines (#) only. Its first line without # must name the columns.")
         return Dialect()
     separator = _separator(path, rows)
-    names = None
-    if remark and all(map(_is_number, _fields(rows[0], separator))):
-        names = _names_in(remark, len(_fields(rows[0], separator)))
-    return Dialect(separator, names, comments)
+    if not (remarks and all(_is_number(field, separator) for field in _fields(rows[0], separator))):
+        return Dialect(separator, None, comments)
+    width = len(_fields(rows[0], separator))
+    found = [_names_in(remark, width) for remark in remarks[-2:]]
+    if len(found) == 2 and found[0] and are_units(found[1] or (), [True] * len(found[1] or ())):
+        return Dialect(separator, found[0], comments, found[1] or ())  # names, and their units below them
+    return Dialect(separator, found[-1], comments)
 
 
 def _separator(path: Path, rows: list[str]) -> str:
     """Find the separator that gives every sampled row as many entries as the header; a comma if there is none."""
     widths = {s: len(_fields(rows[0], s)) for s in (",", ";", "\t")}
+    numbers = [s for s in SEPARATORS if len(f := _fields(rows[0], s)) > 1 and all(_is_number(entry, s) for entry in f)]
+    if len(numbers) == 1:
+        return numbers[0]  # the names stand in a comment
     able = [s for s, width in widths.items() if width > 1]
     fitting = [s for s in able if all(len(_fields(row, s)) == widths[s] for row in rows)]
     if len(fitting) > 1:
@@ -132,7 +194,7 @@ def _names_in(comment: str, width: int) -> tuple[str, ...] | None:
     """Names of the columns in a comment line such as `# t phi u`; None where it does not read as that."""
     text = comment.lstrip().lstrip("#")
     for names in ([f.strip() for f in re.split(r"[,;\t]", text)], re.split(r"[,;\s]+", text.strip())):
-        if len(names) == width and len({*names}) == width and not any(map(_is_number, names)):
+        if len(names) == width and not any(map(_is_number, names)):
             return tuple(names)
     return None
 
@@ -182,7 +244,10 @@ def _unreadable(path: Path, faulty: list[arrow_csv.InvalidRow], dialect: Dialect
     )
 
 
-def _is_number(text: str) -> bool:
+def _is_number(text: str, separator: str = ",") -> bool:
+    """Whether an entry is a number, with a decimal comma if no comma separates the columns."""
+    if separator != "," and WITH_COMMA.fullmatch(text):
+        return True
     try:
         float(text)
     except ValueError:

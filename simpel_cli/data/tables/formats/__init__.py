@@ -1,0 +1,1 @@
+"""One kind of file each: CSV, Parquet, MATLAB, HDF5, MCAP, rosbag2."""
