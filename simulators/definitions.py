@@ -13,6 +13,7 @@ from simulators.quantity import (
     check_keys,
     read_expression,
     read_number,
+    read_range,
     read_term,
     read_uncertain,
     read_unit,
@@ -21,6 +22,7 @@ from simulators.quantity import (
 
 INTERMEDIATE = ("unit", "expression")
 KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior")  # of a parameter
+COVARIATE = ("unit", "range", "column")  # of one that is known in every row
 
 
 class Definition(NamedTuple):
@@ -107,7 +109,7 @@ def read_parameters(
             check_keys(path, node, KNOWN, "a known parameter takes no range")
             read_unit(path, node)
             fixed[name] = read_number(f"{path}.value", node["value"])
-        else:
+        elif "column" not in node:
             check_keys(path, node, UNCERTAIN, "`value: <number>` in place of a range makes it known")
             uncertain.append(read_uncertain(path, name, node))
     derived: dict[str, Definition] = {}
@@ -117,6 +119,21 @@ def read_parameters(
         else:
             derived[name] = definition
     return tuple(uncertain), fixed, derived
+
+
+def read_covariates(nodes: Mapping[str, Any]) -> tuple[tuple[Quantity, ...], dict[str, str]]:
+    """Read the parameters that a column of the measurements knows, such as a payload: quantities, and their columns."""
+    found, columns = [], {}
+    for name, node in nodes.items():
+        if not (isinstance(node, Mapping) and "column" in node):
+            continue
+        path = f"sim.parameters.{name}"
+        check_keys(path, node, COVARIATE, "a parameter that a column knows has no value and no prior")
+        if not isinstance(node["column"], str) or not node["column"]:
+            raise ModelError(f"{path}.column: {node['column']!r} is not the name of a column")
+        found.append(Quantity(name, read_unit(path, node), *read_range(path, node)))
+        columns[name] = node["column"]
+    return tuple(found), columns
 
 
 def _refuse_others(definition: Definition, parameters: Iterable[str]) -> None:

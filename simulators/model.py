@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.definitions import evaluated, in_order, read_intermediates, read_parameters
+from simulators.definitions import evaluated, in_order, read_covariates, read_intermediates, read_parameters
 from simulators.expression import Symbol
 from simulators.quantity import (
     GIVEN,
@@ -103,6 +103,7 @@ class Model:
         lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
         between_rows: input: `held` over a transition at the value of its row, or `linear`, straight to the value of the next
             row. Held where nothing is said.
+        covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
         saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
             is not, as what is measured of it is.
@@ -125,6 +126,7 @@ class Model:
     delay: dict[str, float | str] = field(default_factory=dict)
     lag: dict[str, float | str] = field(default_factory=dict)
     between_rows: dict[str, str] = field(default_factory=dict)
+    covariates: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
     coordinates: Coordinates | None = None
@@ -200,7 +202,8 @@ class Declared:
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
-            {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`).
+            {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`), or {unit, range, column} (known in
+            every row by a column of the measurements, such as a payload).
         intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
             in any order; a name that dynamics and outputs can use.
         tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
@@ -246,7 +249,9 @@ class Declared:
             raise ModelError(f"sim.substeps: {self.substeps!r} is not allowed; give a whole number, at least 1")
         self._check_names()
         states = tuple(read_variable(f"sim.states.{name}", name, node, LIMITS) for name, node in self.states.items())
+        known_per_row, columns = read_covariates(self.parameters)
         inputs = tuple(read_variable(f"sim.inputs.{name}", name, node, GIVEN) for name, node in self.inputs.items())
+        inputs += known_per_row
         if not states and not self.outputs:
             raise ModelError(
                 "sim.states: neither states nor outputs: declare a state, or an output of a static function"
@@ -290,6 +295,7 @@ class Declared:
             delay=read_times("delay", self.inputs, params, fixed),
             lag=read_times("lag", self.inputs, params, fixed),
             between_rows=read_between_rows(self.inputs),
+            covariates=columns,
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
-from simulators.definitions import INTERMEDIATE, KNOWN, UNCERTAIN
+from simulators.definitions import COVARIATE, INTERMEDIATE, KNOWN, UNCERTAIN
 from simulators.quantity import BETWEEN_ROWS, GIVEN, LIMITS, PRIORS, ROLES, VARIABLE
 from simulators.sensors import KEYS as SENSOR
 from simulators.tables import DEGREES
@@ -31,6 +31,7 @@ PROPERTIES: dict[str, Schema] = {
     "delay": NUMBER_OR_NAME | {"description": "How late the input acts, s, or the parameter that says so."},
     "lag": NUMBER_OR_NAME | {"description": "Time constant of a first-order lag, s, or the parameter that says so."},
     "between_rows": {"enum": list(BETWEEN_ROWS), "description": "What the input does from one row to the next."},
+    "column": {"type": "string", "description": "Column of the measurements that knows the parameter in every row."},
     "prior": {"enum": list(PRIORS), "description": "Law of an uncertain parameter; normal: the range is +-2 sd."},
     "value": TERM | {"description": "Of a parameter: the known number. Of an input: the expression in its place."},
     "expression": TERM,
@@ -86,7 +87,7 @@ def either(*options: Schema) -> Schema:
 
 
 _PARAMETER = {"required": ["range"]}, {"required": ["value"]}
-PARAMETER = either(TERM, keys(dict.fromkeys((*UNCERTAIN, *KNOWN))) | {"anyOf": list(_PARAMETER)})
+PARAMETER = either(TERM, keys(dict.fromkeys((*UNCERTAIN, *KNOWN, *COVARIATE))) | {"anyOf": list(_PARAMETER)})
 GAP = named(NUMBER)
 SECTIONS: dict[str, Schema] = {
     "dt": NUMBER,

@@ -62,6 +62,11 @@ def assignment(declared: Declared) -> Assignment:
     control, source = groups.get("control") or Control(), declared.source
     if not source.states:
         raise ConfigError(f"sim: {source.name} has no states, so there is nothing to control.")
+    for name in source.covariates if isinstance(source, Model) else ():
+        raise ConfigError(
+            f"sim.parameters.{name}.column: a column knows it in every row, but a policy does not drive it. Say for which "
+            f"value the policy is: sim.parameters.{name}=<number>."
+        )
     encoding = encoding_of(source, stack=declared.measurements.stack_actions)
     goal = task.bind(encoding)
     true, truth, name = groups.get("truth"), None, ""

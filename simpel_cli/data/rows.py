@@ -8,6 +8,7 @@ from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Source
 from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import DataError
+from simulators.model import Model
 
 
 class Rows(NamedTuple):
@@ -45,9 +46,10 @@ def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
         DataError: a column is missing, an input is declared as not measured, or nothing is measured.
     """
     states, inputs, outputs = ([q.name for q in group] for group in (model.states, model.inputs, model.outputs))
+    known = model.covariates if isinstance(model, Model) else {}
     columns: dict[str, str] = {}
     for name in [*states, *inputs, *outputs]:
-        column = config.columns.get(name, name)
+        column = config.columns.get(name, known.get(name, name))
         if column is None and name in inputs:
             raise DataError(
                 f"data.columns.{name}: an input cannot be estimated, it must be measured. "
@@ -56,7 +58,9 @@ def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
         if column is None or (name in outputs and name not in config.columns and column not in table.columns):
             continue
         if column not in table.columns:
-            if name in inputs:
+            if name in known:
+                cure = f"sim.parameters.{name}.column names it; if it has another name here, say `columns: {{{name}: <name>}}`."
+            elif name in inputs:
                 cure = f"If it has another name, say `columns: {{{name}: <name>}}`."
             else:
                 cure = (

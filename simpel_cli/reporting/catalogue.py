@@ -107,7 +107,10 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
         if quantities:
             terminal.line()
             head = ("parameter" if group == "params" else group[:-1], "unit", "from", "to", "")
-            rows = [(q.name, q.unit, _end(q.low), _end(q.high), _kind(q, roles)) for q in quantities]
+            rows = [
+                (q.name, q.unit, _end(q.low), _end(q.high), _kind(q, roles) or _given(q.name, model))
+                for q in quantities
+            ]
             terminal.line(aligned(head, rows))
     if looked_up := tables(node):
         terminal.line()
@@ -231,6 +234,13 @@ def _words(value: Any) -> str:
 
 def _end(value: float) -> str:
     return f"{value:g}" if math.isfinite(value) else "-"
+
+
+def _given(name: str, model: Any) -> str:
+    """Say what an input does between rows, or which column knows it; nothing of others."""
+    column = getattr(model, "covariates", {}).get(name)
+    word = getattr(model, "between_rows", {}).get(name)
+    return f"known in every row: column {column}" if column else f"{word} between rows" if word else ""
 
 
 def _kind(quantity: Any, roles: Mapping[str, str]) -> str:

@@ -131,7 +131,7 @@ class Expression:
             "velocity": tuple(roles.velocity),
             "angle_velocity": tuple(v for v, s in roles.velocity.items() if s in angles),
             "first_order": roles.first_order,
-            "input": tuple(q.name for q in model.inputs),
+            "input": tuple(q.name for q in model.inputs if q.name not in model.covariates),
             "measured": measured,
             "measured_angle": tuple(n for n in measured if n in angles),
         }

@@ -182,6 +182,11 @@ class Simulate:
         _known("unmeasured", self.unmeasured, measurable)
         if {q.name for q in measurable} <= set(self.unmeasured):
             raise ModelError(f"simulation.unmeasured: nothing of {source.name} is left to measure; leave one out")
+        for name, column in source.covariates.items() if isinstance(source, Model) else ():
+            raise ModelError(
+                f"sim.parameters.{name}: a column knows it; to simulate, give a range alone and "
+                f"simulation.covariates={{{column}: {{parameter: {name}, range: [low, high]}}}}"
+            )
         _known("truth", self.truth, source.params)
         _known("drift", self.drift, source.params)
         _known("initial", self.initial, source.states)

@@ -161,6 +161,10 @@ class Designer:
         """Evaluate at most BATCH episodes; those that are not admissible are left out."""
         self.tried += len(episodes)
         inputs = [signal(e, self.model.inputs, self.rows, self.model.dt) for e in episodes]
+        for j, q in enumerate(self.model.inputs):
+            if q.name in self.model.covariates:  # a payload stays what it is for an episode
+                for u in inputs:
+                    u[:, j] = q.middle
         padded = [*range(len(episodes)), *[0] * (BATCH - len(episodes))]
         u = np.stack([np.concatenate([np.repeat(inputs[i][:1], self.plan.lead, axis=0), inputs[i]]) for i in padded])
         start = np.stack([episodes[i].start for i in padded])

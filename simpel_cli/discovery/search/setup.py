@@ -155,7 +155,7 @@ def questions(model: Model) -> list[Term]:
             "an input that goes straight from a row to the next",
         )
         for q in model.inputs
-        if q.name not in model.between_rows and model.states
+        if q.name not in model.between_rows and q.name not in model.covariates and model.states
     ]  # fmt: skip
 
 
