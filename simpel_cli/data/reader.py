@@ -65,10 +65,13 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     report = [Check("files", True, "; ".join(table.notes)), units] if table.notes else [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
-    finite, rows = values.finite(rows, measured, _column_names(config, model, mapping))
+    # the filter of `discover` takes a row as it is; brought to another dt it has to be complete
+    partial = not whole and dynamic and config.resample is None
+    finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
-    report += [check(rows, model, mapping.outputs) for check in (values.constant, values.ranges)]
+    told = values.filled(rows)
+    report += [check(told, model, mapping.outputs) for check in (values.constant, values.ranges)]
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
@@ -99,11 +102,20 @@ def _trajectories(
     sampling, raw = clock.sampling(rows, model, config)
     cut, starts = cut_at_gaps(rows, raw, config)
     tagged = _segments(model, rows, starts)
-    faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
+    measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
+    there = values.complete(rows, measured)
+    if there.all():
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
+    elif there.sum() > len(there) / 2:  # faults of sensors show in rows that follow each other
+        alone = rows.take(there)
+        pieces = _segments(model, alone, cut_at_gaps(alone, raw, config)[1])
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in pieces], raw)
+    else:
+        faults, computed = [], config.derived
     report = [sampling, cut, *faults]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
-    if mapping.unmeasured:
+    if mapping.unmeasured and there.all():
         episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
@@ -192,7 +204,8 @@ def _unwrap(values: np.ndarray, quantities: tuple[Quantity, ...]) -> np.ndarray:
     for i, quantity in enumerate(quantities):
         turn = period(quantity)
         if turn is not None:
-            turned[:, i] = np.unwrap(values[:, i], period=turn)
+            known = np.isfinite(values[:, i])
+            turned[known, i] = np.unwrap(values[known, i], period=turn)
     return turned
 
 

@@ -15,10 +15,21 @@ def third_difference_std(episodes: Sequence[np.ndarray]) -> float:
     What the signal does faster than that counts as noise, so coarse sampling gives an upper bound.
 
     Args:
-        episodes: one quantity, each (T,), equal steps, angles unwrapped.
+        episodes: one quantity, each (T,), equal steps, angles unwrapped; NaN where a value is missing.
 
     Returns:
         In the quantity's unit; NaN where no episode has `MIN_ROWS` rows.
     """
-    variances = [float(np.mean(np.diff(signal, 3) ** 2)) / 20 for signal in episodes if len(signal) >= MIN_ROWS]
+    runs = [run for signal in episodes for run in _runs(signal)]
+    if not any(
+        len(run) >= MIN_ROWS for run in runs
+    ):  # a sensor that speaks now and then: its own values follow each other
+        runs = [signal[np.isfinite(signal)] for signal in episodes]
+    variances = [float(np.mean(np.diff(run, 3) ** 2)) / 20 for run in runs if len(run) >= MIN_ROWS]
     return float(np.sqrt(np.median(variances))) if variances else float("nan")
+
+
+def _runs(signal: np.ndarray) -> list[np.ndarray]:
+    """Contiguous values of a signal between those that are missing."""
+    gone = np.flatnonzero(~np.isfinite(signal))
+    return [part[np.isfinite(part)] for part in np.split(signal, gone)] if len(gone) else [signal]

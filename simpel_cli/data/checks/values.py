@@ -17,7 +17,7 @@ DEGREES = 361.0  # largest angle in degrees within one turn
 LARGEST = 1e100  # beyond, squares overflow; no sensor gives it
 
 
-def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Check, Rows]:
+def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...], *, partial: bool = False) -> tuple[Check, Rows]:
     """Drop rows with NaN or inf. The jump that stays in `position` cuts the episode there.
 
     The last row of an episode often has no command: it stays, with the input held, since no transition starts there.
@@ -26,6 +26,7 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
         rows: of the file.
         measured: mask (n_states,); the columns of the others are NaN throughout and do not count.
         names: of time, measured states, inputs, outputs and next states, in that order.
+        partial: keep a row in which a state or an output is missing; it is NaN there, and costs that value only.
 
     Raises:
         DataError: no row is left.
@@ -39,6 +40,8 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
     rows = rows._replace(inputs=inputs)
     values = np.column_stack([rows.time, rows.states[:, measured], inputs, rows.outputs, rows.next_states])
     good = np.isfinite(values) & (np.abs(values) < LARGEST)
+    if partial:
+        return _partial(rows, measured, good, names)
     keep = good.all(axis=1) & (rows.episode != "")
     dropped = len(keep) - int(keep.sum())
     if dropped == len(keep):
@@ -53,6 +56,60 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...]) -> tuple[Ch
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
     detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or empty in {where}); episodes are cut there{note}"
     return Check("finite", False, detail), rows.take(keep)
+
+
+def _partial(rows: Rows, measured: np.ndarray, good: np.ndarray, names: tuple[str, ...]) -> tuple[Check, Rows]:
+    """Keep every row whose time and inputs are known; a value that is none becomes NaN.
+
+    Args:
+        rows: of the file.
+        measured: mask (n_states,).
+        good: which values count, (n, columns), in the order of `names`.
+        names: of time, measured states, inputs and outputs.
+
+    Raises:
+        DataError: no row is left, or a column has no value.
+    """
+    first, last = 1 + int(measured.sum()), len(names) - rows.outputs.shape[1]
+    known = good[:, [0, *range(first, last)]].all(axis=1) & (rows.episode != "")
+    sensors = [*range(1, first), *range(last, len(names))]
+    for k in sensors:
+        if not good[known, k].any():
+            raise DataError(
+                f"no value of '{names[k]}' is a number in a row whose time and inputs are known. If it was not measured, set "
+                "`columns: {<state>: null}`."
+            )
+    states, outputs = rows.states.copy(), rows.outputs.copy()
+    states[:, measured] = np.where(good[:, 1:first], states[:, measured], np.nan)
+    outputs = np.where(good[:, last:], outputs, np.nan)
+    missing = {names[k]: int((~good[known, k]).sum()) for k in sensors}
+    notes = [f"{count} of {name}" for name, count in missing.items() if count]
+    dropped = len(known) - int(known.sum())
+    kept = rows._replace(states=states, outputs=outputs).take(known)
+    if not notes and not dropped:
+        return Check("finite", True, f"all {len(known)} rows are finite"), kept
+    cells = f"missing values, each of which costs itself only: {', '.join(notes)}" if notes else ""
+    gone = f"{dropped} of {len(known)} rows dropped, whose time or inputs are not known" if dropped else ""
+    return Check("finite", not dropped, "; ".join(filter(None, [gone, cells]))), kept
+
+
+def filled(rows: Rows) -> Rows:
+    """Return rows in which what is missing repeats the value before it (the first one, the next): for checks of values."""
+
+    def column(values: np.ndarray) -> np.ndarray:
+        there = np.flatnonzero(np.isfinite(values))
+        if len(there) == 0 or len(there) == len(values):
+            return values
+        before = np.maximum(np.searchsorted(there, np.arange(len(values)), side="right") - 1, 0)
+        return values[there[before]]
+
+    states, outputs = (np.apply_along_axis(column, 0, a) if a.size else a for a in (rows.states, rows.outputs))
+    return rows._replace(states=states, outputs=outputs)
+
+
+def complete(rows: Rows, measured: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the rows in which nothing is missing."""
+    return np.isfinite(rows.states[:, measured]).all(axis=1) & np.isfinite(rows.outputs).all(axis=1)
 
 
 def constant(rows: Rows, model: Source, outputs: tuple[str, ...]) -> Check:

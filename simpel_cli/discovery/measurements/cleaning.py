@@ -12,6 +12,7 @@ from simpel_cli.errors import DataError
 from simulators.model import Model
 
 MOST_SHARE = 0.05  # of a channel; more is not a few spikes, and leaving it out would choose the data
+MOST_MISSING = 0.2  # of a channel in which lone values are looked for
 SHOWN = 6  # places that a message names
 LAGS = 5
 FEW_ROWS = 30  # fewer tell nothing about a memory
@@ -58,7 +59,7 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     inputs = [e.inputs for episodes in splits.values() for e in episodes]
     for name in names:
         pieces = [column(e, name, recording, model) for episodes in splits.values() for e in episodes]
-        masks = lone_values(pieces, inputs)
+        masks = _lone(pieces, inputs)
         share = sum(int(m.sum()) for m in masks) / max(sum(len(m) for m in masks), 1)
         if share > MOST_SHARE:
             too_many[name] = share
@@ -75,6 +76,21 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     clean = recording._replace(train=tuple(splits["train"]), test=tuple(splits["test"]), noise_std=noise)
     refuse_far(clean, model)
     return Cleaned(clean, tuple(left_out), too_many)
+
+
+def _lone(pieces: list[np.ndarray], inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Find lone values beside what is missing, which is taken for the straight line between its neighbours.
+
+    Of a channel that is missing in many rows none is looked for: the filter's own test of outliers comes later.
+    """
+    known = [np.isfinite(p) for p in pieces]
+    missing = 1 - sum(int(k.sum()) for k in known) / max(sum(map(len, known)), 1)
+    if missing == 0:
+        return lone_values(pieces, inputs)
+    if missing > MOST_MISSING or not all(k.any() for k in known):
+        return [np.zeros(len(p), bool) for p in pieces]
+    filled = [np.interp(np.arange(len(p)), np.flatnonzero(k), p[k]) for p, k in zip(pieces, known, strict=True)]
+    return [mask & k for mask, k in zip(lone_values(filled, inputs), known, strict=True)]
 
 
 def without_computed(recording: Recording, model: Model) -> Recording:
@@ -113,10 +129,11 @@ def refuse_noise(recording: Recording, model: Model) -> None:
         DataError: names the channels.
     """
     names = measured(recording, model)
-    inputs = [e.inputs for e in recording.train]
     periodic = {q.name for q in model.states if q.periodic}
     for name in names:
-        pieces = [column(e, name, recording, model) for e in recording.train]
+        columns = [column(e, name, recording, model) for e in recording.train]
+        pieces = [c[np.isfinite(c)] for c in columns]
+        inputs = [e.inputs[np.isfinite(c)] for e, c in zip(recording.train, columns, strict=True)]
         if sum(len(p) for p in pieces if len(p) > LAGS) < FEW_ROWS:
             return
         # an angle without order runs away where it is unwrapped

@@ -180,13 +180,20 @@ def scales_of(model: Model, episodes: Sequence[Episode], measured: Sequence[str]
     for i, q in enumerate(model.states):
         known = q.name in measured
         size[q.name] = float(np.nanmax(np.abs(states[:, i]))) if known else max(abs(q.low), abs(q.high))
-        steps = np.concatenate([np.diff(e.states[:, i]) for e in episodes]) / model.dt
-        rate[q.name] = max(float(np.nanstd(steps)) if known else declared[i], 1e-9 * (q.high - q.low))
+        rate[q.name] = max(
+            float(np.std(_rates(episodes, i, model.dt))) if known else declared[i], 1e-9 * (q.high - q.low)
+        )
     for j, q in enumerate(model.inputs):
         size[q.name] = float(np.nanmax(np.abs(inputs[:, j])))
     for k, name in enumerate(outputs):
         size[name] = float(np.nanmax(np.abs(values[:, k])))
     return Scales({k: max(v, 1e-9) for k, v in size.items()}, rate, model.dt)
+
+
+def _rates(episodes: Sequence[Episode], i: int, dt: float) -> np.ndarray:
+    """Return the rate of a state from each of its values to the next that is there."""
+    columns = [(np.flatnonzero(np.isfinite(e.states[:, i])), e.states[:, i]) for e in episodes]
+    return np.concatenate([np.diff(values[there]) / (np.diff(there) * dt) for there, values in columns])
 
 
 def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
