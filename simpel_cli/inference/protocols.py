@@ -118,7 +118,7 @@ class Setting(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What a step reports; mean_kernel: between particles, 0 where they do not interact."""
+    """What a step reports; noise_std: standard deviations; mean_kernel: between particles, 0 where they do not interact."""
 
     loss: Float[Array, ""]
     noise_std: Float[Array, " dy"]

@@ -40,9 +40,9 @@ def information(tail: Float[Array, "*d"]) -> tuple[Float[Array, "*d"], Float[Arr
     return (1 + tail) / (1 + 3 * tail), 2 / (1 + 3 * tail)
 
 
-def standard_deviation(scale: Float[Array, " d"], tail: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Return the standard deviation of a scale."""
-    return scale / jnp.sqrt(1 - 2 * tail)
+def standard_deviation(scale: Float[Array, " d"], tail: Float[Array, " d"] | None) -> Float[Array, " d"]:
+    """Return the standard deviation of a scale; tail None: of a Gaussian they are the same."""
+    return scale if tail is None else scale / jnp.sqrt(1 - 2 * tail)
 
 
 def cdf(z: Float[Array, "*n"], tail: Float[Array, "*m"]) -> Float[Array, "*n"]:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.inference import student_t
 from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
@@ -97,7 +98,9 @@ class ExactGP:
             )
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
-            return state, Info(state.loss, state.noise_std, jnp.zeros((), dtype))
+            return state, Info(
+                state.loss, student_t.standard_deviation(state.noise_std, problem.tails), jnp.zeros((), dtype)
+            )
 
         def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
             """Mean and standard deviation of the function, normalised."""

@@ -198,7 +198,7 @@ class FunctionSpace(ABC):
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)
-            info = Info(-fit / (at_least_one(counted) * self.particles), networks.noise_scale(state.noise), mean_kernel)
+            info = Info(-fit / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
             return after, info
 
         return Inference(networks.init, draw, step, networks.predict, networks.members)

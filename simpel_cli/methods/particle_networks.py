@@ -8,6 +8,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
+from simpel_cli.inference import student_t
 from simpel_cli.inference.networks import MLP, Particles
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.predictive import Predictive
@@ -64,6 +65,10 @@ class Networks(NamedTuple):
     def noise_scale(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
         """Return sigma, normalised."""
         return self.noise.std(rho, self.problem.noise_floor)
+
+    def noise_std(self, rho: Float[Array, " dy"]) -> Float[Array, " dy"]:
+        """Return the standard deviation of the noise, normalised."""
+        return student_t.standard_deviation(self.noise_scale(rho), self.problem.tails)
 
     def ascended(self, state: State, ascent: Particles, slope_noise: Float[Array, " dy"]) -> State:
         """Take a step.

@@ -259,7 +259,9 @@ class Pathwise:
             off = (targets.h[:, chosen] - h) / sigma[None, None]
             (ascent,) = pull_back(off / sigma[None, None])
             after = networks.ascended(state.networks, ascent, jnp.zeros_like(sigma))
-            return state._replace(networks=after), Info(0.5 * jnp.mean(off**2), sigma, jnp.zeros((), dtype))
+            return state._replace(networks=after), Info(
+                0.5 * jnp.mean(off**2), networks.noise_std(state.networks.noise), jnp.zeros((), dtype)
+            )
 
         return Inference(
             init, draw, step,

@@ -78,7 +78,7 @@ class SVGD:
 
             def fit(particles: Particles, rho: Float[Array, " dy"]) -> Float[Array, ""]:
                 return log_likelihood(
-                    self.network.apply_all(particles, x), networks.noise_scale(rho), y, counted, problem.tail
+                    self.network.apply_all(particles, x), networks.noise_scale(rho), y, counted, problem.tails
                 )
 
             value, (slope, slope_noise) = jax.value_and_grad(fit, argnums=(0, 1))(state.particles, state.noise)
@@ -87,9 +87,7 @@ class SVGD:
             flat, unflatten = _flattened(state.particles)
             velocity, mean_kernel = stein_velocity(flat, _flattened(score)[0], self.bandwidth)
             after = networks.ascended(state, unflatten(velocity), weight * slope_noise)
-            info = Info(
-                -value / (at_least_one(counted) * self.particles), networks.noise_scale(state.noise), mean_kernel
-            )
+            info = Info(-value / (at_least_one(counted) * self.particles), networks.noise_std(state.noise), mean_kernel)
             return after, info
 
         return Inference(networks.init, lambda key, state: None, step, networks.predict, networks.members)

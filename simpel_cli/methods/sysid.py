@@ -166,7 +166,9 @@ class SysID:
             )
             best = jnp.argmin(after.loss)
             info = Info(
-                after.loss[best] / jnp.maximum(problem.m, 1).astype(dtype), sigma(after.rho[best]), jnp.zeros((), dtype)
+                after.loss[best] / jnp.maximum(problem.m, 1).astype(dtype),
+                student_t.standard_deviation(sigma(after.rho[best]), problem.tails),
+                jnp.zeros((), dtype),
             )
             return after, info
 
