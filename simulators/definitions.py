@@ -21,7 +21,7 @@ from simulators.quantity import (
 )
 
 INTERMEDIATE = ("unit", "expression")
-KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior")  # of a parameter
+KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior", "per")  # of a parameter
 COVARIATE = ("unit", "range", "column")  # of one that is known in every row
 
 
@@ -119,6 +119,19 @@ def read_parameters(
         else:
             derived[name] = definition
     return tuple(uncertain), fixed, derived
+
+
+def read_groupings(nodes: Mapping[str, Any]) -> dict[str, str]:
+    """Read which uncertain parameters differ from group to group, and the columns that name the groups."""
+    found = {}
+    for name, node in nodes.items():
+        if isinstance(node, Mapping) and "per" in node:
+            if not isinstance(node["per"], str) or not node["per"].isidentifier():
+                raise ModelError(
+                    f"sim.parameters.{name}.per: {node['per']!r} is not the name of a column (letters, digits, underscores)"
+                )
+            found[name] = node["per"]
+    return found
 
 
 def read_covariates(nodes: Mapping[str, Any]) -> tuple[tuple[Quantity, ...], dict[str, str]]:

@@ -12,7 +12,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import casadi
 
-from simulators.definitions import evaluated, in_order, read_covariates, read_intermediates, read_parameters
+from simulators.definitions import (
+    evaluated,
+    in_order,
+    read_covariates,
+    read_groupings,
+    read_intermediates,
+    read_parameters,
+)
 from simulators.expression import Symbol
 from simulators.quantity import (
     GIVEN,
@@ -104,6 +111,9 @@ class Model:
         between_rows: input: `held` over a transition at the value of its row, or `linear`, straight to the value of the next
             row. Held where nothing is said.
         covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
+        per: uncertain parameter -> column of the groups from one to another of which it differs (`simulators.groups`).
+        groups: column -> names of the groups, where they are known: then inputs and parameters of groups are there.
+        base: the model without them; None: this is it.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
         saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
             is not, as what is measured of it is.
@@ -127,6 +137,9 @@ class Model:
     lag: dict[str, float | str] = field(default_factory=dict)
     between_rows: dict[str, str] = field(default_factory=dict)
     covariates: dict[str, str] = field(default_factory=dict)
+    per: dict[str, str] = field(default_factory=dict)
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    base: "Model | None" = None
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
     coordinates: Coordinates | None = None
@@ -202,7 +215,8 @@ class Declared:
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
-            {unit, range, prior: uniform|normal|lognormal} (uncertain, see `Quantity`), or {unit, range, column} (known in
+            {unit, range, prior: uniform|normal|lognormal, per: COLUMN} (uncertain, see `Quantity`; with `per` it differs from
+            group to group, see `simulators.groups`), or {unit, range, column} (known in
             every row by a column of the measurements, such as a payload).
         intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
             in any order; a name that dynamics and outputs can use.
@@ -296,6 +310,7 @@ class Declared:
             lag=read_times("lag", self.inputs, params, fixed),
             between_rows=read_between_rows(self.inputs),
             covariates=columns,
+            per=read_groupings(self.parameters),
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },

@@ -31,6 +31,7 @@ PROPERTIES: dict[str, Schema] = {
     "delay": NUMBER_OR_NAME | {"description": "How late the input acts, s, or the parameter that says so."},
     "lag": NUMBER_OR_NAME | {"description": "Time constant of a first-order lag, s, or the parameter that says so."},
     "between_rows": {"enum": list(BETWEEN_ROWS), "description": "What the input does from one row to the next."},
+    "per": {"type": "string", "description": "Column that names the groups from one to another of which it differs."},
     "column": {"type": "string", "description": "Column of the measurements that knows the parameter in every row."},
     "prior": {"enum": list(PRIORS), "description": "Law of an uncertain parameter; normal: the range is +-2 sd."},
     "value": TERM | {"description": "Of a parameter: the known number. Of an input: the expression in its place."},

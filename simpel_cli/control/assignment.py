@@ -62,6 +62,11 @@ def assignment(declared: Declared) -> Assignment:
     control, source = groups.get("control") or Control(), declared.source
     if not source.states:
         raise ConfigError(f"sim: {source.name} has no states, so there is nothing to control.")
+    for name, column in source.per.items() if isinstance(source, Model) else ():
+        raise ConfigError(
+            f"sim.parameters.{name}.per: it differs from one {column} to another, and a policy does not know which it drives. "
+            f"Leave `per` out: a policy for all of them, or give the value of one: sim.parameters.{name}=<number>."
+        )
     for name in source.covariates if isinstance(source, Model) else ():
         raise ConfigError(
             f"sim.parameters.{name}.column: a column knows it in every row, but a policy does not drive it. Say for which "

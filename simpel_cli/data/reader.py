@@ -12,6 +12,7 @@ from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
 from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
+from simpel_cli.data.groups import group_names, with_groups
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
@@ -42,6 +43,9 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         ConfigError: a key that does not fit the simulator.
         DataError: anything wrong with file, columns, rows or units.
     """
+    known: dict[str, tuple[str, ...]] = {}
+    if isinstance(model, Model) and model.base is not None:  # of a fit: its groups are known
+        model, known = model.base, model.groups
     if not config.paths:
         return Recording((), (), (), dict(config.noise_std), (), (), ())
     measurable = (*model.states, *model.outputs)
@@ -72,6 +76,10 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     report += [finite, split]
     told = values.filled(rows)
     report += [check(told, model, mapping.outputs) for check in (values.constant, values.ranges)]
+    groups: dict[str, tuple[str, ...]] = {}
+    if isinstance(model, Model) and model.per:
+        groups = known or group_names(model, table, rows)
+        rows = with_groups(rows, table, groups)
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
         noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
@@ -92,6 +100,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         checks=tuple(report),
         files=(*table.files, *cards),
         derived=tuple(name for name in computed if name in mapping.columns),
+        groups=groups,
     )
 
 

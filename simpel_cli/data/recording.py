@@ -47,6 +47,7 @@ class Recording(NamedTuple):
     checks: tuple[Check, ...]
     files: tuple[Path, ...]  # what was read
     derived: tuple[str, ...] = ()  # names of the states whose column was computed from another one's
+    groups: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  column -> names of the groups that were trained on
 
 
 class Transitions(NamedTuple):

@@ -28,9 +28,14 @@ class Domain:
         return np.array([q.low for q in quantities]), np.array([q.high for q in quantities])
 
     def sample(self, key: PRNGKeyArray, n: int, dtype: DTypeLike) -> Float[Array, "n dx"]:
-        """Draw n network inputs (data units), uniform in the box, angles encoded."""
+        """Draw n network inputs (data units), uniform in the box, angles encoded; each of one group."""
         low, high = (jnp.asarray(b, dtype) for b in self.bounds())
         points = jax.random.uniform(key, (n, low.shape[0]), dtype) * (high - low)[None] + low[None]
+        for columns in self._one_of():
+            key, key_group = jax.random.split(key)
+            group = jax.random.randint(key_group, (n,), 0, columns.shape[1], jnp.int32)
+            for row in columns:
+                points = points.at[:, row].set(jax.nn.one_hot(group, len(row), dtype=dtype))
         ds = len(self.encoding.states)
         return self.encoding.to_x(points[:, :ds], points[:, ds:])
 
@@ -42,4 +47,16 @@ class Domain:
         for a, b, periodic in zip(low, high, angles, strict=True):
             mean.extend([0.0, 0.0] if periodic else [(a + b) / 2])
             std.extend([np.sqrt(0.5)] * 2 if periodic else [(b - a) / np.sqrt(12)])
-        return np.array(mean), np.array(std)
+        found = np.array(mean), np.array(std)
+        for columns in self._one_of():
+            share = 1 / columns.shape[1]
+            for row in columns:
+                at = row - len(self.encoding.states) + self.encoding.dim_state
+                found[0][at], found[1][at] = share, np.sqrt(share * (1 - share))
+        return found
+
+    def _one_of(self) -> list[np.ndarray]:
+        """Columns of the box that say which group a row is of, (stack + 1, groups) each."""
+        enc = self.encoding
+        first = len(enc.states) + np.arange(enc.stack + 1)[:, None] * len(enc.inputs)
+        return [first + np.array(slots)[None] for slots in enc.one_of]

@@ -26,6 +26,7 @@ class Encoding:
         outputs: measured quantities that are not states.
         stack: number of past actions in x.
         linear: inputs that go straight from a row to the next; a transition depends on their next values, too.
+        one_of: inputs of which one is 1 and the others are 0: the group that a row is of (`simulators.groups`).
     """
 
     states: tuple[Quantity, ...]
@@ -33,6 +34,7 @@ class Encoding:
     outputs: tuple[Quantity, ...] = ()
     stack: int = 0
     linear: tuple[int, ...] = ()
+    one_of: tuple[tuple[int, ...], ...] = ()
 
     @property
     def dim_state(self) -> int:

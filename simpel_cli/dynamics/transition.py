@@ -17,6 +17,7 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.input_delay import delayed_inputs, prompt_inputs
 from simpel_cli.dynamics.integrate import State, rk4_step
 from simpel_cli.errors import ConfigError
+from simulators.groups import slots_of
 from simulators.model import Model, Quantity
 from simulators.worlds.world import World
 
@@ -47,7 +48,8 @@ def encoding_of(model: Model | World, outputs: tuple[str, ...] = (), stack: int 
     """Return the coordinates of a model whose named outputs are measured."""
     measured = tuple(q for q in model.outputs if q.name in outputs)
     linear = model.linear if isinstance(model, Model) else ()
-    return Encoding(states=model.states, inputs=model.inputs, outputs=measured, stack=stack, linear=linear)
+    one_of = slots_of(model) if isinstance(model, Model) else ()
+    return Encoding(model.states, model.inputs, measured, stack, linear, one_of)
 
 
 def transition(model: Model, encoding: Encoding) -> Transition:

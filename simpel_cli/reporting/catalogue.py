@@ -108,7 +108,13 @@ def _show_sim(terminal: Terminal, entry: Entry, plugins: tuple[str, ...]) -> Non
             terminal.line()
             head = ("parameter" if group == "params" else group[:-1], "unit", "from", "to", "")
             rows = [
-                (q.name, q.unit, _end(q.low), _end(q.high), _kind(q, roles) or _given(q.name, model))
+                (
+                    q.name,
+                    q.unit,
+                    _end(q.low),
+                    _end(q.high),
+                    ", ".join(filter(None, [_kind(q, roles), _given(q.name, model)])),
+                )
                 for q in quantities
             ]
             terminal.line(aligned(head, rows))
@@ -240,6 +246,8 @@ def _given(name: str, model: Any) -> str:
     """Say what an input does between rows, or which column knows it; nothing of others."""
     column = getattr(model, "covariates", {}).get(name)
     word = getattr(model, "between_rows", {}).get(name)
+    if by := getattr(model, "per", {}).get(name):
+        return f"differs per {by}"
     return f"known in every row: column {column}" if column else f"{word} between rows" if word else ""
 
 

@@ -76,7 +76,7 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     data = {"stack_actions": study.measurements.stack_actions} | own["data"]
     choices = study.choices | {"data": own["choices"].get("data", "")}
     declared = study.declared._replace(config=study.declared.config | {"choices": choices})
-    other = _opened_whole(declared, data, job.data_folder)
+    other = _opened_whole(declared, data, job.data_folder, study.recording.groups)
     if other.system.encoding != study.system.encoding:
         raise ConfigError("data: these data have other measured quantities than the run was fitted to.")
     recording = other.recording
@@ -89,10 +89,12 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     return other._replace(recording=recording._replace(checks=checks))
 
 
-def _opened_whole(declared: Declared, data: dict[str, Any], folder: Path) -> Study:
+def _opened_whole(declared: Declared, data: dict[str, Any], folder: Path, groups: dict[str, tuple[str, ...]]) -> Study:
     """Read measurements whose split does not matter; a file of one episode can be split within it only."""
     whole = data | {"n_train": None, "n_episodes": None}
     try:
-        return open_study(declared.changed(data=whole | {"split": {"by": "episode"}}), folder)
+        return open_study(declared.changed(data=whole | {"split": {"by": "episode"}}), folder, groups=groups)
     except DataError:
-        return open_study(declared.changed(data=whole | {"split": {"by": "time", "test_fraction": 0.5}}), folder)
+        return open_study(
+            declared.changed(data=whole | {"split": {"by": "time", "test_fraction": 0.5}}), folder, groups=groups
+        )

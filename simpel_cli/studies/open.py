@@ -11,6 +11,8 @@ from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import Settings, configure
 from simpel_cli.studies.declared import Declared
+from simulators.groups import grouped
+from simulators.model import Model
 
 
 class Study(NamedTuple):
@@ -71,13 +73,16 @@ class Study(NamedTuple):
         }
 
 
-def open_study(declared: Declared, data_folder: Path, *, whole: bool = True) -> Study:
+def open_study(
+    declared: Declared, data_folder: Path, *, whole: bool = True, groups: dict[str, tuple[str, ...]] | None = None
+) -> Study:
     """Read the measurements of a configuration and bind its simulator to them.
 
     Args:
         declared: the configuration.
         data_folder: of the data YAML.
         whole: whether every state is needed in every row (see `data.reader.read`).
+        groups: column -> names of the groups that a fit knows; None: those of the training rows.
 
     Raises:
         ConfigError: a key that does not fit the simulator.
@@ -85,8 +90,12 @@ def open_study(declared: Declared, data_folder: Path, *, whole: bool = True) -> 
     """
     device = configure(declared.settings)
     measurements, source = declared.measurements, declared.source
+    if groups and isinstance(source, Model):
+        source = grouped(source, groups)
     # the split does not depend on run.seed: every seed of a sweep is tested on the same episodes
     recording = read(measurements, source, data_folder, 0, whole=whole)
+    if isinstance(source, Model) and recording.groups:
+        source = grouped(source.base or source, recording.groups)
     return Study(declared, device, system_of(source, recording.outputs, measurements.stack_actions), recording)
 
 

@@ -14,6 +14,7 @@ from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.errors import DataError
 from simulators.effects.term import BETWEEN_ROWS
+from simulators.groups import deltas_of, spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -28,6 +29,8 @@ ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse tha
 NEARLY = 0.01  # of a parameter's range
 QUIETER = 0.1  # of the range of log q, than at the very start
 STARTS = 6  # of the model as it is
+SPREADS = (0.03, 0.1, 0.2, 0.35, 0.6, 1.0)  # of groups, of their largest
+MORE_SPREADS = 3  # by expectation from the best of these
 
 
 def asked(effects: int) -> float:
@@ -57,7 +60,10 @@ class Search:
         self.plan, self.fitter, self.report = plan, fitter, report
         self.terms = plan.augmented.terms
         n_p, n_r, n_q = plan.coordinates.sizes
-        self.always = tuple(range(len(plan.augmented.model.params))) + tuple(range(n_p, n_p + n_r + n_q))
+        params = [q.name for q in plan.augmented.model.params]
+        # a spread of groups and what the groups are have no common optimum: it is chosen by the evidence, and moves no more
+        self.spreads = tuple(i for i, name in enumerate(params) if name in spreads_of(plan.augmented.model))
+        self.always = tuple(i for i in range(len(params)) if i not in self.spreads) + tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         self.ones = np.ones(len(plan.windows.episode))
@@ -134,7 +140,46 @@ class Search:
                 "measured start (`simpel simulate`), narrow sim.parameters, or guard roots, logarithms and divisions "
                 "with max(., 1e-9)."
             )
-        return self.best((), found)
+        best = self.best((), found)
+        return self._with_spreads(best) if self.spreads else best
+
+    def _with_spreads(self, base: Trial) -> Trial:
+        """Choose the spreads of groups by the evidence: the same share of their ranges first, then by expectation."""
+        free = self.free(())
+        starts = [self._respread(base.optimum, dict.fromkeys(self.spreads, level)) for level in SPREADS]
+        best = self.best((), self.fitter([Hypothesis(z, free, self.ones) for z in starts]))
+        for _ in range(MORE_SPREADS):
+            sizes = {row: float(best.optimum.z[row]) * self._squared(best.optimum, row) ** 0.5 for row in self.spreads}
+            z = self._respread(best.optimum, {row: float(np.clip(s, 0.01, 1.0)) for row, s in sizes.items()})
+            (found,) = self.fitter([Hypothesis(z, free, self.ones)])
+            if not found.log_evidence > best.optimum.log_evidence:
+                break
+            best = self.best((), [found])
+        return best
+
+    def _deltas(self, row: int) -> list[int]:
+        """Rows of what the groups of a spread are."""
+        return deltas_of(self.plan.augmented.model, row)
+
+    def _squared(self, optimum: Optimum, row: int) -> float:
+        """Mean expected square of what the groups are, in standard deviations of the population."""
+        own = []
+        for i in self._deltas(row):
+            k, span = optimum.free.index(i), self.plan.coordinates.high[i] - self.plan.coordinates.low[i]
+            own.append(
+                self.plan.coordinates.value(i, float(optimum.centre[k])) ** 2 + optimum.covariance[k, k] * span**2
+            )
+        return float(np.mean(own))
+
+    def _respread(self, optimum: Optimum, levels: dict[int, float]) -> np.ndarray:
+        """Return a start with other spreads in which the groups are where they were."""
+        z = optimum.z.copy()
+        for row, level in levels.items():
+            ratio = max(float(z[row]), 1e-3) / level
+            for i in self._deltas(row):
+                z[i] = self.plan.coordinates.unit(i, ratio * self.plan.coordinates.value(i, float(z[i])))
+            z[row] = level
+        return z
 
     def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:
         """Return the best of some fits of one set of terms, or an earlier one that was better."""

@@ -1,0 +1,124 @@
+"""Parameters that differ from group to group, on planted groups."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from simpel_cli.data import Measurements, Recording, read
+from simpel_cli.discovery.likelihood.fit import Fitter
+from simpel_cli.discovery.search.setup import setup
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.dynamics.transition import encoding_of, transition
+from simpel_cli.errors import DataError
+from simulators.groups import UNSEEN, grouped
+from simulators.model import Declared, Model, ModelError
+from simulators.worlds.groups import Group, Spread
+from simulators.worlds.simulate import Simulate
+
+GROUPS, SPREAD = 6, 0.35
+
+
+def slider(**keys) -> Model:
+    return Declared(
+        "slider", dt=0.05, substeps=4, states={"v": {"unit": "m/s", "range": [-4, 4]}},
+        inputs={"f": {"unit": "N", "range": [-3, 3], "between_rows": "held"}},
+        parameters={"c": {"unit": "1/s", "range": [0.3, 4], **keys}, "b": {"unit": "1/kg", "range": [0.5, 2]}},
+        dynamics={"v": "b*f - c*v"},
+    ).model()  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    found = Simulate(
+        episodes=4 * GROUPS, steps=40, seed=2, noise_std={"v": 0.01}, truth={"c": 1.2, "b": 1.0}, initial={"v": [-2, 2]},
+        groups={"ball": Group(GROUPS, {"c": Spread(SPREAD, "lognormal")})},
+    ).run(slider())  # fmt: skip
+    path = tmp_path_factory.mktemp("rig") / "runs.parquet"
+    pd.DataFrame(found.columns).to_parquet(path)
+    return path, found.card["truth_by_group"]["ball"]
+
+
+def recorded(path, model: Model, **keys) -> Recording:
+    given = {"path": str(path), "time": "t", "episode": "episode", "split": {"column": "split"}} | keys
+    return read(Measurements(**given), model, path.parent, 0)
+
+
+def fitted(model: Model, data: Recording) -> tuple[dict[str, float], dict[str, float], float]:
+    """Values, standard deviations, and process noise of the calibrated simulator."""
+    plan = setup(model, data, (), [], 2)
+    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2]
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=width))
+    base = search.base().optimum
+    values = {q.name: plan.coordinates.value(i, float(base.z[i])) for i, q in enumerate(model.params)}
+    span = plan.coordinates.high - plan.coordinates.low
+    sds = {
+        q.name: float(np.sqrt(base.covariance[base.free.index(i), base.free.index(i)]) * span[i])
+        for i, q in enumerate(model.params)
+        if i in base.free
+    }
+    return values, sds, _last(plan, base.z)
+
+
+def _last(plan, z: np.ndarray) -> float:
+    i = sum(plan.coordinates.sizes) - 1
+    return plan.coordinates.value(i, float(z[i]))
+
+
+def test_every_group_has_its_own_value_about_a_common_one(made) -> None:
+    path, truth = made
+    model = slider(per="ball")
+    data = recorded(path, model)
+    assert len(data.groups["ball"]) == GROUPS
+    whole = grouped(model, data.groups)
+    values, sds, noise = fitted(whole, data)
+    for name in data.groups["ball"]:
+        own = values["c"] * np.exp(values["c_spread"] * values[f"c_of_{name}"])
+        assert abs(own / truth[name]["c"] - 1) < 0.05
+    logs = np.log([truth[name]["c"] for name in data.groups["ball"]])
+    assert 0.5 * logs.std() < values["c_spread"] < 2 * logs.std()
+    assert sds[f"c_of_{UNSEEN}"] > 0.7  # nothing is known of it but the population
+    _, _, alike = fitted(slider(), recorded(path, slider()))
+    assert noise < 0.3 * alike  # one value for all of them leaves much to noise
+
+
+def test_a_group_that_was_never_seen_is_another(made) -> None:
+    path, _ = made
+    model = slider(per="ball")
+    known = {"ball": recorded(path, model).groups["ball"][:3]}
+    data = recorded(path, grouped(model, known))
+    rows = np.concatenate([e.inputs for e in (*data.train, *data.test)])
+    assert rows.shape[1] == 1 + 3 + 1
+    assert np.all(rows[:, 1:].sum(axis=1) == 1)
+    assert 0.4 < rows[:, -1].mean() < 0.6
+
+
+def test_a_transition_is_that_of_the_group() -> None:
+    whole = grouped(slider(per="ball"), {"ball": ("a ball", "b")})
+    assert [q.name for q in whole.inputs] == ["f", "ball_is_a_ball", "ball_is_b", "ball_is_another"]
+    assert [q.name for q in whole.params] == ["c", "b", "c_spread", "c_of_a_ball", "c_of_b", "c_of_another"]
+    with jax.enable_x64(True):
+        step = transition(whole, encoding_of(whole)).step
+        phi = jnp.array([1.0, 1.0, 0.5, 1.0, -1.0, 0.0])
+        found = [float(step(jnp.array([2.0, 0.0, *slot]), phi)[0]) for slot in np.eye(3)]
+    rates = np.exp([0.5, -0.5, 0.0])
+    np.testing.assert_allclose(found, 2 * (np.exp(-rates * 0.05) - 1), rtol=1e-6)
+
+
+def test_what_is_wrong_is_said(made, tmp_path) -> None:
+    path, _ = made
+    with pytest.raises(DataError, match="column 'subject' is missing"):
+        recorded(path, slider(per="subject"))
+    table = pd.read_parquet(path)
+    file = tmp_path / "runs.parquet"
+    for change, message in (
+        ({"ball": "one"}, "has 1 group in the training rows \\(one\\), which tells nothing of a spread"),
+        ({"ball": np.arange(len(table)).astype(str)}, "it names rows, not groups"),
+        ({"ball": np.where(np.arange(len(table)) % 40 < 20, "x", "y")}, "changes from 'x' to 'y' within episode 0"),
+    ):
+        table.assign(**change).to_parquet(file)
+        with pytest.raises(DataError, match=message):
+            recorded(file, slider(per="ball"))
+    with pytest.raises(ModelError, match=r"sim.parameters.c.per: 3 is not the name of a column"):
+        slider(per=3)
