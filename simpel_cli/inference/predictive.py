@@ -112,7 +112,8 @@ class Predictive(NamedTuple):
         else:
             noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=y.dtype)
         others = jax.lax.map(self.mahalanobis, centres + self.noise_scale[None, None] * noise)
-        return (jnp.sum(others < self.mahalanobis(y)[None], axis=0) + 0.5) / (draws + 1)
+        nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
+        return (nearer + 0.5) / (draws + 1)
 
     def _white(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Return y about the mixture's mean, in units of its covariance."""
