@@ -11,6 +11,7 @@ Reference: Gelman and Hill (2007), Data analysis using regression and multilevel
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi
@@ -21,6 +22,7 @@ from simulators.quantity import Quantity
 
 UNSEEN = "another"  # the group of rows whose group was not trained on
 DELTA = (-2.0, 2.0)  # +-2 standard deviations
+SPREAD, MEMBER = "spread", "member"  # roles of parameters: of the population, of one group
 
 
 def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
@@ -55,11 +57,11 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
         by = model.per[q.name]
         ratio = q.low > 0
         at = len(model.params) + len(own)
-        own.append(Quantity(f"{q.name}_spread", "1" if ratio else q.unit, 0.0, _most(q, ratio=ratio)))
+        own.append(Quantity(f"{q.name}_spread", "1" if ratio else q.unit, 0.0, _most(q, ratio=ratio), role=SPREAD))
         pairs = []
         for slot, word in zip(slots[by], words((*groups[by], UNSEEN)), strict=True):
             pairs.append((first[slot], len(model.params) + len(own)))
-            own.append(Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal"))
+            own.append(Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER))
         places[i] = (ratio, at, pairs)
     for q in (*inputs, *own):
         if q.name in taken:
@@ -87,9 +89,14 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
     )
 
 
-def spreads_of(model: Model) -> tuple[str, ...]:
-    """Return the names of the spreads."""
-    return tuple(f"{name}_spread" for name in model.per) if model.groups else ()
+def spreads_of(params: Sequence[Quantity]) -> dict[int, list[int]]:
+    """Return the rows of the spreads, and of what the groups are, without the group that was never seen."""
+    found = {}
+    for i, q in enumerate(params):
+        if q.role == SPREAD:
+            after = [k for k in range(i + 1, len(params)) if params[k].role != MEMBER]
+            found[i] = list(range(i + 1, min(after, default=len(params)) - 1))
+    return found
 
 
 def slots_of(model: Model) -> tuple[tuple[int, ...], ...]:
@@ -99,12 +106,6 @@ def slots_of(model: Model) -> tuple[tuple[int, ...], ...]:
         found.append(tuple(range(first, first + len(names) + 1)))
         first += len(names) + 1
     return tuple(found)
-
-
-def deltas_of(model: Model, row: int) -> list[int]:
-    """Return the rows of what the groups of a spread are, without the group that was never seen."""
-    by = model.per[model.params[row].name.removesuffix("_spread")]
-    return list(range(row + 1, row + 1 + len(model.groups[by])))
 
 
 def words(names: tuple[str, ...]) -> list[str]:

@@ -1,5 +1,6 @@
 """What a controller is asked for, and where: the groups of control bound to one simulator."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -76,6 +77,8 @@ def assignment(declared: Declared) -> Assignment:
     goal = task.bind(encoding)
     true, truth, name = groups.get("truth"), None, ""
     if true is not None:
+        if isinstance(true, Model):  # driven as the rig is, where it says nothing of its own
+            true = replace(true, between_rows=dict(declared.measurements.between_rows) | true.between_rows)
         truth, name = _true_world(true, task, goal, encoding, source.dt), true.name
     return Assignment(task, encoding, goal, control, groups["policy"], groups.get("planner"), source, truth, name)
 

@@ -45,8 +45,11 @@ def check_compatible(
             isinstance(other, Model) and q.name in [other.inputs[k].name for k in other.linear],
         ]
         if ways[0] != ways[1]:
-            one, two = ("linear" if way else "held" for way in ways)
-            raise ConfigError(f"{key}: {q.name} of {other.name} is {two} between rows; that of sim is {one}.")
+            own_word, its_word = ("linear" if way else "held" for way in ways)
+            raise ConfigError(
+                f"{key}: {q.name} of {other.name} is {its_word} between rows; that of sim is {own_word}. Say the same of both "
+                f"(inputs.{q.name}.between_rows), or data.between_rows={{{q.name}: {its_word}}}."
+            )
     if not math.isclose(other.dt, dt, rel_tol=1e-6):
         raise ConfigError(f"{key}: a step of {other.name} is {other.dt:g} s; one of sim is {dt:g} s.")
     takes = {q.name: q for q in other.inputs}

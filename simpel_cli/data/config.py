@@ -169,8 +169,9 @@ class Measurements:
         ):
             for name in names:
                 if name not in allowed:
+                    what = "input" if key == "between_rows" else "quantity"
                     raise ConfigError(
-                        f"data.{key}.{name}: the simulator has no such quantity (it has: {', '.join(allowed)})."
+                        f"data.{key}.{name}: the simulator has no such {what} (it has: {', '.join(allowed)})."
                         + did_you_mean(name, list(allowed))
                     )
 

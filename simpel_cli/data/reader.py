@@ -54,9 +54,10 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     linear = model.linear if isinstance(model, Model) else ()
     if linear and config.layout == "transitions":
         name = model.inputs[linear[0]].name
+        key = "data" if name in config.between_rows else f"sim.inputs.{name}"
         raise ConfigError(
-            f"data.between_rows.{name}: linear, but the next value of an input is not known in layout 'transitions', whose "
-            "rows do not follow each other. Store trajectories, or set it to held."
+            f"{key}.between_rows: {name} is linear, but the next value of an input is not known in layout 'transitions', whose "
+            f"rows do not follow each other. Store trajectories, or set data.between_rows={{{name}: held}}."
         )
     found = [file for path in config.paths for file in locate(path, base)]
     table = read_table(tuple(file.path for file in found), [file.named for file in found])

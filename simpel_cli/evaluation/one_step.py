@@ -57,8 +57,9 @@ def _measure(p: Predictive, y: jax.Array) -> tuple[jax.Array, ...]:
         if p.tail is None
         else jax.scipy.special.ndtri((1 + jnp.minimum(inner, 1 - 1e-12)) / 2) ** 2
     )
+    distance = p.mahalanobis(y) if p.tail is None else p.share_within(y)
     columns = (
-        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), p.cdf(y), r, p.mahalanobis(y), p.mean, p.std, p.epistemic_std,
+        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), p.cdf(y), r, distance, p.mean, p.std, p.epistemic_std,
     )  # fmt: skip
     return columns
 
@@ -70,6 +71,8 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
     p = jax.tree.map(lambda a: a.astype(jnp.float64), p)
     columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
     nll, joint, crps, pit, r, distance, mean, std, epistemic = columns
+    if p.tail is not None:  # a share of the mass: the distance that a Gaussian of the same share would have
+        distance = chi_squared_quantile(distance, dy)
     error = y - mean
     quantiles = np.stack([chi_squared_quantile(LEVELS, 1)] * dy + [chi_squared_quantile(LEVELS, dy)])
     r_all = np.column_stack([r, distance])

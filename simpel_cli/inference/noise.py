@@ -1,4 +1,4 @@
-"""The model of the measurement noise: one learned standard deviation per output, above a floor."""
+"""The model of the measurement noise: one learned scale per output, above a floor."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ Numbers = Array | np.ndarray  # assembled on the host, read by compiled programs
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Observation noise of the Gaussian likelihood, one standard deviation per output, in normalised units.
+    """Observation noise, one scale per output, in normalised units: of Gaussian noise its standard deviation.
 
     sigma = floor + softplus(rho), learned with prior log sigma ~ N(log sigma_init, prior_std^2), or fixed at sigma_init.
 

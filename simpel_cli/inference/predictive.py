@@ -96,12 +96,33 @@ class Predictive(NamedTuple):
 
     def mahalanobis(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Squared Mahalanobis distance of y under the mixture's mean and covariance (chi-squared with dy if Gaussian)."""
+        return jnp.sum(self._white(y) ** 2, axis=-1)
+
+    def share_within(self, y: Float[Array, "n dy"], draws: int = 512) -> Float[Array, " n"]:
+        """Share of the mixture's mass with a smaller Mahalanobis distance than y, strictly between 0 and 1.
+
+        Where the noise has heavy tails that distance has no law in closed form: it is compared with those of draws.
+        """
+        key_particle, key_noise = jax.random.split(jax.random.key(0))
+        n, dy = y.shape
+        chosen = jax.random.randint(key_particle, (draws, n), 0, self.particles.shape[0], jnp.int32)
+        centres = jnp.take_along_axis(self.particles, chosen[:, :, None], axis=0)
+        if self.tail is None:
+            noise = jax.random.normal(key_noise, (draws, n, dy), y.dtype)
+        else:
+            noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=y.dtype)
+        others = jax.lax.map(self.mahalanobis, centres + self.noise_scale[None, None] * noise)
+        nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
+        return (nearer + 0.5) / (draws + 1)
+
+    def _white(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+        """Return y about the mixture's mean, in units of its covariance."""
         centred = self.particles - self.mean[None]
         covariance = jnp.einsum("lni,lnj->nij", centred, centred) / self.particles.shape[0]
         covariance = covariance + jnp.diag(self.noise_std**2)[None]
         factor = jnp.linalg.cholesky(covariance)
         white = jax.scipy.linalg.solve_triangular(factor, (y - self.mean)[..., None], lower=True)
-        return jnp.sum(white[..., 0] ** 2, axis=-1)
+        return white[..., 0]
 
 
 def _mixture(log_densities: Float[Array, "L *n"]) -> Float[Array, "*n"]:

@@ -7,13 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from simpel_cli.errors import ConfigError
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.protocols import Normaliser
 from simpel_cli.inference.system import System
 from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales
 from simpel_cli.priors.marginal_likelihood import TYPICAL_SCALE, noise_of_smooth
-from simpel_cli.priors.noise_law import LEAST_GAIN, LEAST_ROWS, TAILS, Law, Moments, gain_of_tails, student_t
+from simpel_cli.priors.noise_law import (
+    LEAST_GAIN,
+    LEAST_ROWS,
+    TAILS,
+    Law,
+    Moments,
+    gain_of_tails,
+    student_t,
+    weights_of,
+)
 
 SCALE_POINTS, SCALE_DRAWS = 512, 512
 WORLD_SCALE_POINTS = 128
@@ -115,11 +125,18 @@ def chosen(
     Returns:
         The choices, and the nats by which Student's t is ahead of the Gaussian, per seed; NaN: it was not looked at.
     """
+    if law == "student_t" and not chooser.noise.learn:
+        raise ConfigError(
+            "data.noise.law: student_t, but its degrees of freedom and scale are learned, and method.noise.learn=false keeps "
+            "the noise as it is declared. Set method.noise.learn=true, or data.noise.law=gaussian."
+        )
     looked = [_looked(chooser, x, y, key, law) for (x, y), key in zip(training, keys, strict=True)]
     gain = np.mean([one.gain for one in looked], axis=0).max()
     if law == "gaussian" or looked[0].moments is None or (law == "auto" and not gain > LEAST_GAIN):
         return [Chosen(one.gap, one.noise, None) for one in looked], float(gain)
-    return [_heavy(chooser, one, x, y) for one, (x, y) in zip(looked, training, strict=True)], float(gain)
+    return [_heavy(chooser, one, x, y, key) for one, (x, y), key in zip(looked, training, keys, strict=True)], float(
+        gain
+    )
 
 
 def _looked(chooser: Chooser, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray, law: str) -> Looked:
@@ -165,7 +182,7 @@ def _smooth(
     return np.maximum(sigma, np.asarray(left))
 
 
-def _heavy(chooser: Chooser, looked: Looked, x: np.ndarray, targets: np.ndarray) -> Chosen:
+def _heavy(chooser: Chooser, looked: Looked, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray) -> Chosen:
     """Return the choice for noise that is Student's t."""
     assert looked.moments is not None
     assert looked.rows is not None
@@ -173,4 +190,8 @@ def _heavy(chooser: Chooser, looked: Looked, x: np.ndarray, targets: np.ndarray)
     scale = _smooth(chooser, x[looked.rows], looked.moments, law.scale, law.weights)
     weights = np.ones(targets.shape)
     weights[looked.rows] = law.weights
+    rest = np.setdiff1d(np.arange(len(x)), looked.rows)
+    for k, rows in enumerate(np.array_split(rest, -(-len(rest) // chooser.most_rows)) if len(rest) else []):
+        moments = chooser.moments(x[rows], targets[rows], jax.random.fold_in(key, k))
+        weights[rows] = weights_of(law, moments)
     return Chosen(law.gap, scale, law._replace(weights=weights, scale=scale))

@@ -74,6 +74,8 @@ class ExactGP:
         if prior.kernel is None:
             raise ConfigError("method: gp needs the gap process of prior=simulator; prior=simulator_only has none.")
         kernel, scale, dtype = prior.kernel, problem.normaliser, problem.x.dtype
+        # noise with heavy tails holds the white model error, too (`priors.noise_law`)
+        white = prior.white_variance if problem.weights is None else 0.0
         counts = (jnp.arange(problem.x.shape[0], dtype=jnp.int32) < problem.m).astype(jnp.float64)
         kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
 
@@ -89,7 +91,7 @@ class ExactGP:
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = weighted_spectra(gram(kernel, known, known), left, problem.m, problem.weights)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = best_of_each(data, kappa, prior.white_variance, prior_std, problem.noise_floor, problem.noise_init)
+            best = best_of_each(data, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
                 data if problem.weights is not None else jax.tree.map(lambda a: a[0], data),
@@ -119,9 +121,9 @@ class ExactGP:
                 reach: Float[Array, "n m"],
                 turned: Float[Array, " m"],
             ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-                total = kappa**2 * values + sigma.astype(jnp.float64) ** 2 + prior.white_variance
+                total = kappa**2 * values + sigma.astype(jnp.float64) ** 2 + white
                 taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
-                std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + prior.white_variance)
+                std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + white)
                 return kappa**2 * (reach @ (turned / total)), std
 
             each = jax.vmap(of_output, in_axes=(0, 0, own, own, 0), out_axes=1)

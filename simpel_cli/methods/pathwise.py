@@ -123,8 +123,9 @@ class Pathwise:
         rows, count = evenly(n_rows, jnp.asarray(problem.m), self.most_rows)
         counts = (jnp.arange(len(rows), dtype=jnp.int32) < count).astype(jnp.float64)
         known = scale.x(jnp.asarray(problem.x)[rows])
-        weights = jnp.ones((len(rows), dim_y), jnp.float64)
+        weights, white = jnp.ones((len(rows), dim_y), jnp.float64), prior.white_variance
         if problem.weights is not None:  # Student's t noise: a Gaussian whose variance differs from row to row
+            white = 0.0  # it holds the white model error (`priors.noise_law`)
             weights = jnp.asarray(problem.weights)[rows].astype(jnp.float64)
 
         def simulated(key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: Int[Array, " n"]) -> Float[Array, "n dy N"]:
@@ -188,7 +189,7 @@ class Pathwise:
                 spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(counts[few]))
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
-                return best_scales(spectrum, one, prior.white_variance, prior_std, floor[None], typical[None]).noise[0]
+                return best_scales(spectrum, one, white, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(
@@ -209,7 +210,7 @@ class Pathwise:
             own = centred(draws)
             mean = jnp.mean(draws[:, :, self.particles :].astype(jnp.float64), axis=2)
             sigma = noise_by_marginal_likelihood(own, mean)
-            common = sigma**2 + prior.white_variance
+            common = sigma**2 + white
             variance = common[None] / weights  # of every row: of one that is far off, it is large
             measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
             noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None]

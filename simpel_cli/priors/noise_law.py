@@ -1,11 +1,12 @@
 """The law of the measurement noise, Gaussian or Student's t, by the leave-one-out log score of the training transitions.
 
-Under the prior's moments, y ~ N(mean(g), C + sigma^2 W^-1), C = cov(g) + (kappa^2 R + w I), the error of row j where it is left
+Under the prior's moments, y ~ N(mean(g), C + sigma^2 W^-1), C = cov(g) + kappa^2 R, the error of row j where it is left
 out and its variance are
 
     e_j = [A^-1 r]_j / [A^-1]_jj,    v_j = 1/[A^-1]_jj,    A = C + sigma^2 W^-1,    r = y - mean(g)
 
-so that e_j/sqrt(v_j) is a held-out sample of the law. Which law, is asked of all outputs together, with one tail 1/nu and a
+so that e_j/sqrt(v_j) is a held-out sample of the law. The white model error w is part of the noise here: whose tails it has, no
+data tell. Which law, is asked of all outputs together, with one tail 1/nu and a
 scale per output: fifty rows of one output seldom hold an outlier. If it is Student's t, weights W, scales and tails follow by
 expectation and conditional maximisation; every tail has a normal prior about the common one.
 
@@ -35,7 +36,7 @@ class Law(NamedTuple):
         tail: 1/nu, (dy,).
         weights: expected weight of every row, (m, dy).
         gap: kappa with these weights, normalised, (dy,).
-        scale: sigma, normalised, (dy,).
+        scale: of noise and white model error together, normalised, (dy,).
     """
 
     tail: np.ndarray
@@ -62,7 +63,7 @@ class Moments(NamedTuple):
     def of_output(self, i: int, kappa: float) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance of the function, (m, m), and residual, (m,)."""
         covariance = np.atleast_2d(np.cov(self.samples[:, :, i], rowvar=False))
-        covariance = covariance + kappa**2 * self.correlation + self.white * np.eye(len(self.correlation))
+        covariance = covariance + kappa**2 * self.correlation
         return covariance, self.targets[:, i] - self.samples[:, :, i].mean(axis=0)
 
 
@@ -113,7 +114,7 @@ def gain_of_tails(moments: Moments, kappa: np.ndarray, sigma: np.ndarray) -> np.
         kappa: scale of the gap, (dy,).
         sigma: Gaussian noise, (dy,).
     """
-    total = np.zeros(len(TAILS))
+    total, sigma = np.zeros(len(TAILS)), np.sqrt(sigma**2 + moments.white)
     for i in range(len(sigma)):
         covariance, residual = moments.of_output(i, kappa[i])
         found = left_out(covariance, residual, np.full(len(residual), sigma[i] ** 2))
@@ -135,14 +136,15 @@ def student_t(
         given: kappa where it is declared, NaN where it is chosen, (dy,).
     """
     m, size = moments.targets.shape
-    kappa, sigma = kappa.copy(), sigma.copy()
+    kappa, sigma = kappa.copy(), np.sqrt(sigma**2 + moments.white)
     weights, tail = np.ones((m, size)), np.full(size, 0.25)
     for turn in range(ROUNDS):
         scores = np.zeros((size, len(TAILS)))
         squared = np.zeros((m, size))
         for i in range(size):
             if turn and np.isnan(given[i]) and turn % 3 == 1:
-                kappa[i], sigma[i] = _weighted_scales(moments, i, weights[:, i], noise_init[i])
+                kappa[i], own = _weighted_scales(moments, i, weights[:, i], noise_init[i])
+                sigma[i] = np.sqrt(own**2 + moments.white)
             covariance, residual = moments.of_output(i, kappa[i])
             found = left_out(covariance, residual, sigma[i] ** 2 / weights[:, i])
             scores[i] = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))[0][1:]
@@ -153,6 +155,18 @@ def student_t(
         data = np.sum(weights * squared, axis=0) / m
         sigma = np.exp((m * np.log(data) / 2 + np.log(noise_init) / 2) / (m + 0.5))
     return Law(tail, weights, kappa, sigma)
+
+
+def weights_of(law: Law, moments: Moments) -> np.ndarray:
+    """Return the expected weights of other rows under a law, (m, dy); moments: of the prior there."""
+    m, size = moments.targets.shape
+    weights = np.ones((m, size))
+    for _ in range(ROUNDS):
+        for i in range(size):
+            covariance, residual = moments.of_output(i, law.gap[i])
+            found = left_out(covariance, residual, law.scale[i] ** 2 / weights[:, i])
+            weights[:, i] = (1 + law.tail[i]) / (1 + law.tail[i] * found.squared / law.scale[i] ** 2)
+    return weights
 
 
 def _tails(scores: np.ndarray) -> np.ndarray:

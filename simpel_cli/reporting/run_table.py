@@ -60,10 +60,12 @@ def law_of_noise(study: Study, fitted: Fitted) -> str:
     """Return the law of the noise, and what it was chosen by."""
     problems, gain, asked = fitted.assembled.problems, fitted.assembled.heavy_tails, study.measurements.law
     if problems.tail is None:
-        if asked != "auto":
+        if asked == "gaussian":
             return "Gaussian, as data.noise.law says"
+        if not study.method.noise.learn:
+            return "Gaussian, fixed (method.noise.learn=false)"
         if np.isnan(gain):
-            return "Gaussian: too few rows to ask for another law (data.noise.law)"
+            return "Gaussian: too few rows to learn another law from (data.noise.law)"
         ahead = f"ahead by {gain:.1f} nats only" if gain > 0 else f"behind by {-gain:.1f} nats"
         return f"Gaussian: Student's t is {ahead} in leave-one-out log score"
     said = "as data.noise.law says" if asked != "auto" else f"ahead by {gain:.1f} nats of leave-one-out log score"

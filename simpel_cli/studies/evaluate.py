@@ -74,9 +74,18 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     """
     # the past inputs of the fit, where the new data do not say otherwise
     data = {"stack_actions": study.measurements.stack_actions} | own["data"]
+    data["between_rows"] = dict(study.measurements.between_rows) | (data.get("between_rows") or {})
     choices = study.choices | {"data": own["choices"].get("data", "")}
     declared = study.declared._replace(config=study.declared.config | {"choices": choices})
     other = _opened_whole(declared, data, job.data_folder, study.recording.groups)
+    linear = study.system.encoding.linear
+    for i, q in enumerate(study.system.encoding.inputs):
+        ways = [i in linear, i in other.system.encoding.linear]
+        if ways[0] != ways[1]:
+            was, is_ = ("linear" if way else "held" for way in ways)
+            raise ConfigError(
+                f"data.between_rows.{q.name}: {is_}, but the run was fitted to inputs that are {was} between rows."
+            )
     if other.system.encoding != study.system.encoding:
         raise ConfigError("data: these data have other measured quantities than the run was fitted to.")
     recording = other.recording

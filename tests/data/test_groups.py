@@ -6,12 +6,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from simpel_cli.data import Measurements, Recording, read
+from simpel_cli.data import Measurements, Recording, read, transitions
 from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.dynamics.domain import Domain
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import DataError
+from simpel_cli.evaluation import test_arrays as arrays_of
+from simpel_cli.inference.assemble import assemble
+from simpel_cli.inference.system import normaliser_of, system_of
+from simpel_cli.methods.sysid import SysID, identified
+from simpel_cli.priors.function_prior import SimulatorPrior
+from simpel_cli.scores.gaussian import Gaussian
 from simulators.groups import UNSEEN, grouped
 from simulators.model import Declared, Model, ModelError
 from simulators.worlds.groups import Group, Spread
@@ -122,3 +129,40 @@ def test_what_is_wrong_is_said(made, tmp_path) -> None:
             recorded(file, slider(per="ball"))
     with pytest.raises(ModelError, match=r"sim.parameters.c.per: 3 is not the name of a column"):
         slider(per=3)
+
+
+def test_an_identified_simulator_knows_every_group(made) -> None:
+    """Not the spread: beside what the groups are, the most probable one is the largest."""
+    path, truth = made
+    model = slider(per="ball")
+    data = recorded(path, model)
+    whole = grouped(model, data.groups)
+    with jax.enable_x64(True):
+        system = system_of(whole, (), 0)
+        x, y = arrays_of(transitions(data.train, 0), system.encoding)
+        normaliser = normaliser_of(system, jax.random.key(0))
+        method = SysID(starts=4)
+        done = assemble(
+            system, normaliser, SimulatorPrior(gap=None), Gaussian(), [(x, y)], data.noise_std, {}, noise=method.noise, pool=1,
+            keys=[jax.random.key(1)], precision="float64", law="gaussian",
+        )  # fmt: skip
+        problem = jax.tree.map(lambda a: a[0], done.problems)
+        found = np.asarray(identified(method, done.setting, problem, jax.random.key(2)))
+    values = dict(zip([q.name for q in whole.params], found, strict=True))
+    for name in data.groups["ball"]:
+        own = values["c"] * np.exp(values["c_spread"] * values[f"c_of_{name}"])
+        assert abs(own / truth[name]["c"] - 1) < 0.1
+
+
+def test_points_of_the_domain_are_of_one_group_each() -> None:
+    whole = grouped(slider(per="ball"), {"ball": ("a", "b")})
+    domain = Domain(encoding_of(whole, stack=1))
+    points = np.asarray(domain.sample(jax.random.key(0), 300, jnp.float32))
+    assert points.shape == (300, 1 + 2 * 4)
+    for block in (points[:, 2:5], points[:, 6:9]):
+        assert set(np.unique(block)) == {0.0, 1.0}
+        assert np.all(block.sum(axis=1) == 1)
+    assert np.array_equal(points[:, 2:5], points[:, 6:9])
+    mean, std = domain.x_moments()
+    np.testing.assert_allclose(mean[2:5], 1 / 3)
+    np.testing.assert_allclose(std[6:9], np.sqrt(2) / 3)

@@ -100,7 +100,7 @@ class Table:
         self.search: Any = searched("b", [force(name) for name in "ABCDE"])
         self.search.fitter = self
         self.evidence = {frozenset(names): value for names, value in evidence.items()}
-        self.search.banned = {i for i, term in enumerate(self.search.terms) if term.depends_on}
+        self.search.banned |= {i for i, term in enumerate(self.search.terms) if term.depends_on}
 
     def name(self, term: int) -> str:
         return "?" if self.search.terms[term].depends_on else self.search.terms[term].effect
@@ -300,9 +300,9 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
         monkeypatch.setattr(calibration, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
     plan = real.plan._replace(spare=test)
-    search, _, left, _ = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
-    np.testing.assert_array_equal(left.ok, none_left)
-    np.testing.assert_array_equal(search.plan.spare.ok, none_left)  # what is held out to judge effects
+    found = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal, {})
+    np.testing.assert_array_equal(found.test.ok, none_left)
+    np.testing.assert_array_equal(found.search.plan.spare.ok, none_left)  # what is held out to judge effects
 
 
 def test_a_search_goes_on_from_what_is_left_of_it() -> None:

@@ -9,9 +9,10 @@ import pytest
 from scipy import stats
 
 from simpel_cli.errors import ConfigError
-from simpel_cli.inference.assemble import SCALE_DRAWS, SCALE_POINTS, WORLD_SCALE_POINTS, assemble
+from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.protocols import padded_length
+from simpel_cli.inference.scales import SCALE_DRAWS, SCALE_POINTS, WORLD_SCALE_POINTS
 from simpel_cli.inference.system import WORLD_POINTS, normaliser_of, system_of  # fmt: skip
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simpel_cli.priors.noise_law import LEAST_GAIN, TAILS, Moments, gain_of_tails, left_out, student_t
+from simpel_cli.priors.noise_law import LEAST_GAIN, TAILS, Moments, gain_of_tails, left_out, student_t, weights_of
 
 OUTPUTS, SIGMA, KAPPA = 4, 0.05, 0.5
 
@@ -67,3 +67,12 @@ def test_rows_that_are_far_off_count_less() -> None:
     law = law_of(moments)
     assert law.weights[7, 2] < 0.02
     assert np.median(law.weights[:, 2]) > 0.5
+
+
+def test_rows_that_were_not_looked_at_have_weights_of_their_own() -> None:
+    law = law_of(planted(200, 3.0, 2))
+    other = planted(100, 3.0, 3)
+    other.targets[5, 1] += 40 * SIGMA
+    weights = weights_of(law, other)
+    assert weights[5, 1] < 0.02
+    assert 0.5 < np.median(weights) < 1.4

@@ -76,7 +76,7 @@ def _partial(rows: Rows, measured: np.ndarray, good: np.ndarray, names: tuple[st
     for k in sensors:
         if not good[known, k].any():
             raise DataError(
-                f"no value of '{names[k]}' is a number in a row whose time and inputs are known. If it was not measured, set "
+                f"no row can be used: '{names[k]}' has no numbers where time and inputs are known. If it was not measured, set "
                 "`columns: {<state>: null}`."
             )
     states, outputs = rows.states.copy(), rows.outputs.copy()

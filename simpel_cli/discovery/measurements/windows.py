@@ -22,7 +22,7 @@ class Windows(NamedTuple):
     Args:
         y: (W, T, ny) measurements, 0 where they do not count.
         ok: (W, T, ny) 1 where a measurement counts, else 0.
-        u: (W, lead + T, nu) inputs, held from a row to the next, with `lead` rows of the past in front.
+        u: (W, lead + T, nu) inputs, with `lead` rows of the past in front.
         start: (W, nx) guess of the first state.
         spread: (W, nx) standard deviation of the first state about it.
         episode: (W,) index of the episode, in the order given.

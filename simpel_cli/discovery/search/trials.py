@@ -14,7 +14,7 @@ from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.errors import DataError
 from simulators.effects.term import BETWEEN_ROWS
-from simulators.groups import deltas_of, spreads_of
+from simulators.groups import spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -60,9 +60,9 @@ class Search:
         self.plan, self.fitter, self.report = plan, fitter, report
         self.terms = plan.augmented.terms
         n_p, n_r, n_q = plan.coordinates.sizes
-        params = [q.name for q in plan.augmented.model.params]
+        params = plan.augmented.model.params
         # a spread of groups and what the groups are have no common optimum: it is chosen by the evidence, and moves no more
-        self.spreads = tuple(i for i, name in enumerate(params) if name in spreads_of(plan.augmented.model))
+        self.spreads = spreads_of(params)
         self.always = tuple(i for i in range(len(params)) if i not in self.spreads) + tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
@@ -157,14 +157,10 @@ class Search:
             best = self.best((), [found])
         return best
 
-    def _deltas(self, row: int) -> list[int]:
-        """Rows of what the groups of a spread are."""
-        return deltas_of(self.plan.augmented.model, row)
-
     def _squared(self, optimum: Optimum, row: int) -> float:
         """Mean expected square of what the groups are, in standard deviations of the population."""
         own = []
-        for i in self._deltas(row):
+        for i in self.spreads[row]:
             k, span = optimum.free.index(i), self.plan.coordinates.high[i] - self.plan.coordinates.low[i]
             own.append(
                 self.plan.coordinates.value(i, float(optimum.centre[k])) ** 2 + optimum.covariance[k, k] * span**2
@@ -176,7 +172,7 @@ class Search:
         z = optimum.z.copy()
         for row, level in levels.items():
             ratio = max(float(z[row]), 1e-3) / level
-            for i in self._deltas(row):
+            for i in self.spreads[row]:
                 z[i] = self.plan.coordinates.unit(i, ratio * self.plan.coordinates.value(i, float(z[i])))
             z[row] = level
         return z

@@ -33,6 +33,7 @@ from simulators.effects import Term
 from simulators.effects.expression import per
 from simulators.effects.term import OPERATORS, SENSOR
 from simulators.expression import symbols_used
+from simulators.groups import slots_of
 
 BEFORE, WITHOUT, AFTER = "before", "without", "after"
 GRID = 101  # points of an effect's curve
@@ -168,10 +169,11 @@ def _coverage(search: Search, recording: Recording) -> Columns:
     model = search.plan.augmented.model
     states = np.concatenate([e.states for e in recording.train])
     inputs = np.concatenate([e.inputs for e in recording.train])
+    slots = {model.inputs[j].name for of in slots_of(model) for j in of}  # which group a row is of has no range
     rows = []
     for values, group in ((states, model.states), (inputs, model.inputs)):
         for j, q in enumerate(group):
-            if q.name in recording.estimated or not np.isfinite(values[:, j]).any():
+            if q.name in recording.estimated or q.name in slots or not np.isfinite(values[:, j]).any():
                 continue
             column = np.angle(np.exp(1j * values[:, j])) if q.periodic else values[:, j]
             rows.append(
