@@ -404,7 +404,7 @@ def test_a_run_goes_on_when_its_reader_goes_away(tmp_path: Path) -> None:
     assert child.returncode == 0
     lines = lines_of_a_run_that_is_done(tmp_path / "run")
     assert [line.split()[0] for line in lines if line[0] != " "] == [
-        "simpel", "data", "simulator", "prior", "test", "(intervals:", "report", "next",
+        "simpel", "data", "simulator", "noise", "prior", "test", "(intervals:", "report", "next",
     ]  # fmt: skip
 
 
