@@ -28,7 +28,7 @@ class Predictive(NamedTuple):
     @property
     def noise_std(self) -> Float[Array, " dy"]:
         """Standard deviation of the observation noise."""
-        return student_t.standard_deviation(self.noise_scale, self.tail)
+        return student_t.standard_deviation(jnp.asarray(self.noise_scale), self.tail)
 
     @property
     def mean(self) -> Float[Array, "n dy"]:

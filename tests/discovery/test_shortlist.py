@@ -8,6 +8,7 @@ from simpel_cli.discovery.likelihood.latent_force import Force
 from simpel_cli.discovery.search import shortlist as module
 from simpel_cli.discovery.search.setup import key_of
 from simpel_cli.discovery.search.shortlist import shortlist
+from simulators.effects.term import BETWEEN_ROWS
 
 
 @pytest.mark.parametrize(("force", "name"), [("drag", "drag"), ("load", "load"), ("input", None)])
@@ -18,18 +19,18 @@ def test_the_term_that_the_latent_force_looks_like_is_kept(
     monkeypatch.setattr(module, "NAMED", 1)
     monkeypatch.setattr(module, "UNNAMED", 0)
     search = searched("b")
-    plan = search.plan
+    plan, terms = search.plan, [t for t in search.terms if t.kind != BETWEEN_ROWS]  # these are asked of all models
     random = np.random.default_rng(1)
     count, rows = plan.windows.y.shape[:2]
     state, u = random.normal(size=(count, rows, 2)), random.normal(size=(count, rows, 1))
     v = state[..., 1]
     pushed = {"drag": -0.4 * v * np.abs(v), "load": 0.4 + 0 * v, "input": 0.1 * u[..., 0]}[force]
     latent = np.stack([0 * v, pushed + 0.02 * random.normal(size=v.shape)], axis=-1)[:, :-1]
-    kept = shortlist(plan, plan.start, Force(state, latent, np.full_like(latent, 0.02)), u, search.terms)
+    kept = shortlist(plan, plan.start, Force(state, latent, np.full_like(latent, 0.02)), u, terms)
     gains = dict(
         zip(
-            map(key_of, search.terms),
-            module._gains(plan, plan.start, Force(state, latent, latent), u, search.terms),
+            map(key_of, terms),
+            module._gains(plan, plan.start, Force(state, latent, latent), u, terms),
             strict=True,
         )
     )
