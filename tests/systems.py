@@ -6,10 +6,19 @@ from typing import Any
 import yaml
 
 from simpel_cli.config.build import build
-from simulators.model import Model
+from simulators.model import Declared, Model
 
 SIMS = Path(__file__).parents[1] / "conf" / "sim"
 SYMBOLIC = sorted(p.stem for p in SIMS.glob("*.yaml") if "_target_: simulators.worlds" not in p.read_text())
+
+
+CART = Declared(
+    name="cart", dt=0.1,
+    states={"s": {"unit": "m", "range": [-10, 10]}, "v": {"unit": "m/s", "range": [-5, 5]}},
+    inputs={"u": {"unit": "V", "range": [-2, 2]}},
+    dynamics={"s": "v", "v": "u - v"},
+    outputs={"force": {"unit": "N", "expression": "-v"}},
+).model()  # fmt: skip
 
 
 def node(name: str) -> dict[str, Any]:

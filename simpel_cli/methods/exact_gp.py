@@ -23,7 +23,7 @@ from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.priors.gaussian_process import gram
-from simpel_cli.priors.marginal_likelihood import Spectrum, best_of_each, weighted_spectra
+from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, weighted_spectra
 
 
 class State(NamedTuple):
@@ -91,10 +91,10 @@ class ExactGP:
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             data = weighted_spectra(gram(kernel, known, known), left, problem.m, problem.weights)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = best_of_each(data, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
+            best = best_scales(data, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
-                data if problem.weights is not None else jax.tree.map(lambda a: a[0], data),
+                data,
                 best.noise.astype(dtype),
                 (jnp.sum(best.loss) / jnp.maximum(jnp.sum(counts), 1)).astype(dtype),
             )

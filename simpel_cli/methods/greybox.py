@@ -23,7 +23,7 @@ from simpel_cli.methods.sysid import SysID, identified, simulator_of
 from simpel_cli.priors.function_prior import GPPrior
 from simpel_cli.priors.marginal_likelihood import (
     MOST_ROWS,
-    best_of_each,
+    best_scales,
     evenly,
     noise_of_smooth,
     weighted_spectra,
@@ -124,7 +124,7 @@ class GreyBox:
 
             prior_std = noise.prior_std if noise.learn else None
             weights = None if problem.weights is None else jnp.asarray(problem.weights)[rows]
-            best = best_of_each(weighted_spectra(correlation(1.0), y, m, weights), kappa, 0.0, prior_std, floor, init)
+            best = best_scales(weighted_spectra(correlation(1.0), y, m, weights), kappa, 0.0, prior_std, floor, init)
             if not floors:
                 return best.scale.astype(dtype), jnp.asarray(floor)
             sigma = jnp.maximum(

@@ -39,13 +39,14 @@ def evenly(padded: int, rows: Int[Numbers, ""], most: int) -> tuple[Int[Array, "
 class Spectrum(NamedTuple):
     """Residuals in the eigenbasis of the correlation at the training inputs, float64.
 
-    Padding has eigenvalue 0 and no residual.
+    Padding has eigenvalue 0 and no residual. One basis serves all outputs (k = dy), or, with a leading axis, each has its own
+    (k = 1).
     """
 
-    values: Float[Array, " m"]
-    vectors: Float[Array, "m m"]
-    turned: Float[Array, "m dy"]
-    padding: Float[Array, ""]
+    values: Float[Array, "*dy m"]
+    vectors: Float[Array, "*dy m m"]
+    turned: Float[Array, "*dy m k"]
+    padding: Float[Array, "*dy"]
 
 
 class MarginalLikelihoodFit(NamedTuple):
@@ -76,12 +77,12 @@ def weighted_spectra(
     rows: Int[Numbers, ""],
     weights: Float[Numbers, "m dy"] | None,
 ) -> Spectrum:
-    """Return the spectrum of every output, leading axis dy, of rows that count by their weights; None: all alike.
+    """Return the spectrum of rows that count by their weights, one per output, leading axis dy; None: all alike, one for all.
 
     Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I).
     """
     if weights is None:
-        return jax.tree.map(lambda a: a[None], spectrum(correlation, residual, rows))
+        return spectrum(correlation, residual, rows)
     root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
 
     def of_output(root: Float[Array, " m"], left: Float[Array, " m"]) -> Spectrum:
@@ -89,27 +90,6 @@ def weighted_spectra(
 
     found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T))
     return found
-
-
-def best_of_each(
-    given: Spectrum,
-    kappa: Float[Numbers, " dy"] | None,
-    white: float,
-    prior_std: float | None,
-    floor: Float[Numbers, " dy"],
-    typical: Float[Numbers, " dy"],
-) -> MarginalLikelihoodFit:
-    """Return `best_scales` of spectra with a leading axis: 1, common to all outputs, or dy, one each."""
-    if given.values.shape[0] == 1:
-        return best_scales(jax.tree.map(lambda a: a[0], given), kappa, white, prior_std, floor, typical)
-
-    def of_output(one: Spectrum, scales: tuple[Array, ...]) -> MarginalLikelihoodFit:
-        *known, floor, typical = scales
-        return best_scales(one, known[0] if known else None, white, prior_std, floor, typical)
-
-    alone = tuple(jnp.asarray(a)[:, None] for a in (kappa, floor, typical) if a is not None)
-    found = jax.vmap(of_output)(given, alone)
-    return MarginalLikelihoodFit(*(a[:, 0] for a in found))
 
 
 def best_scales(
@@ -123,7 +103,7 @@ def best_scales(
     """Return what maximises the penalised marginal likelihood of every output.
 
     Args:
-        given: residuals.
+        given: residuals; of one basis for all outputs, or, with a leading axis, of one each.
         kappa: scale of the Gaussian process; None: it is chosen, too.
         white: w, its white variance.
         prior_std: log sigma ~ N(log typical, prior_std^2); None: sigma is `typical`.
@@ -139,7 +119,9 @@ def best_scales(
         penalty = jnp.zeros_like(scales)
 
     def of_output(
+        values: Float[Array, " m"],
         turned: Float[Array, " m"],
+        padding: Float[Array, ""],
         scales: Float[Array, " s"],
         penalty: Float[Array, " s"],
         floor: Float[Array, ""],
@@ -149,8 +131,8 @@ def best_scales(
         levels = levels if prior_std is not None else typical[None]
 
         def minus(scale: Float[Array, ""], penalty: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
-            total = scale**2 * given.values + sigma**2 + white
-            empty = given.padding * jnp.log(sigma**2 + white)
+            total = scale**2 * values + sigma**2 + white
+            empty = padding * jnp.log(sigma**2 + white)
             data = 0.5 * jnp.sum(turned**2 / total + jnp.log(total)) - 0.5 * empty
             return data + penalty + 0.5 * (jnp.log(sigma / typical) / (prior_std or 1.0)) ** 2
 
@@ -158,9 +140,11 @@ def best_scales(
         i, j = jnp.unravel_index(jnp.argmin(losses), losses.shape)
         return scales[i], levels[j], losses[i, j]
 
-    return MarginalLikelihoodFit(
-        *jax.vmap(of_output, in_axes=(1, 0, 0, 0, 0))(given.turned, scales, penalty, floor, typical)
-    )
+    shared = given.values.ndim == 1
+    own = None if shared else 0
+    turned = given.turned.T if shared else given.turned[..., 0]
+    each = jax.vmap(of_output, in_axes=(own, 0, own, 0, 0, 0, 0))
+    return MarginalLikelihoodFit(*each(given.values, turned, given.padding, scales, penalty, floor, typical))
 
 
 def noise_of_smooth(
@@ -190,7 +174,7 @@ def noise_of_smooth(
     """
     left = jnp.asarray(residual)
     found = [
-        best_of_each(weighted_spectra(correlation(f), left, rows, weights), None, white, prior_std, floor, typical)
+        best_scales(weighted_spectra(correlation(f), left, rows, weights), None, white, prior_std, floor, typical)
         for f in LONGER
     ]
     noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))

@@ -110,6 +110,7 @@ def case(
     draws: int = 1028,
     rows: int | None = None,
     fields: dict[str, Any] | None = None,
+    law: str = "auto",
 ) -> Case:
     """Return the problem of one set.
 
@@ -121,6 +122,7 @@ def case(
         draws: N of the simulator.
         rows: training rows, drawn with repeats from those of the set (to time other sizes); None: as they are.
         fields: of the method.
+        law: of the noise: gaussian, student_t or auto.
     """
     arrays = dict(np.load(folder() / f"{name}.npz"))
     kind, size = name.rsplit("_n", 1)
@@ -134,6 +136,6 @@ def case(
     assembled = assemble(
         system, normaliser, prior_of(method, scale, draws), build(node("score", score), "score"), [(x, y)] * seeds,
         NOISE[kind], NOISE[kind] if kind == "pendulum" else {}, noise=rule.noise, pool=rule.pool,
-        keys=[stream(s, "prior") for s in range(seeds)], precision="float32",
+        keys=[stream(s, "prior") for s in range(seeds)], precision="float32", law=law,
     )  # fmt: skip
     return Case(rule, assembled, normaliser, jnp.stack([stream(s, "train") for s in range(seeds)]), arrays)

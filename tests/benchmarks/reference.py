@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t
 
+from simpel_cli.data.config import LAWS
 from simpel_cli.evaluation import Posterior, one_step
 from simpel_cli.inference import loop
 from simpel_cli.runs.files import write_table
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--score", choices=SCORES, default="gaussian")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--gap-scale", default="auto", type=scale_of, help="declared, auto or a number")
+    parser.add_argument("--law", choices=LAWS, default="auto", help="of the noise")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=JSON", help="fields of the method")
     parser.add_argument("--out", type=Path, help="a Parquet file, one row per set, method and seed")
     options = parser.parse_args()
@@ -87,7 +89,15 @@ def main() -> None:
     table: dict[str, list[Any]] = {k: [] for k in ("set", "method", "score", "seed", *KEYS, "kappa", "noise_std")}
     for name in options.sets:
         for method in options.methods:
-            given = case(name, method, options.score, seeds=options.seeds, scale=options.gap_scale, fields=fields)
+            given = case(
+                name,
+                method,
+                options.score,
+                seeds=options.seeds,
+                scale=options.gap_scale,
+                fields=fields,
+                law=options.law,
+            )
             found = scored(given)
             reference = published[name].get(method)
             theirs = f"{reference['nll']:.2f} / {reference['rmse']:.3f}" if reference else "-"

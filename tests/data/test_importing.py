@@ -8,22 +8,15 @@ import pyarrow as pa
 import pytest
 import yaml
 from pyarrow import parquet
+from systems import CART
 
 from simpel_cli.config.build import build
 from simpel_cli.data import Measurements, read
 from simpel_cli.data.importing.draft import Draft, draft
 from simpel_cli.data.importing.match import factor_between
 from simpel_cli.errors import DataError
-from simulators.model import Declared, Model
+from simulators.model import Model
 
-CART = Declared(
-    name="cart",
-    dt=0.1,
-    states={"s": {"unit": "m", "range": [-10, 10]}, "v": {"unit": "m/s", "range": [-5, 5]}},
-    inputs={"u": {"unit": "V", "range": [-2, 2]}},
-    dynamics={"s": "v", "v": "u - v"},
-    outputs={"force": {"unit": "N", "expression": "-v"}},
-).model()
 N = 12
 
 

@@ -7,21 +7,14 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_matrix
+from systems import CART
 
 from simpel_cli.data import Measurements, Recording, read
 from simpel_cli.data.tables.formats import optional
 from simpel_cli.data.tables.formats.mat_cures import cure
 from simpel_cli.data.tables.read_file import read_sheet
 from simpel_cli.errors import DataError
-from simulators.model import Declared
 
-CART = Declared(
-    name="cart",
-    dt=0.1,
-    states={"s": {"unit": "m", "range": [-10, 10]}, "v": {"unit": "m/s", "range": [-5, 5]}},
-    inputs={"u": {"unit": "V", "range": [-2, 2]}},
-    dynamics={"s": "v", "v": "u - v"},
-).model()
 T = 0.1 * np.arange(40)
 COLUMNS = {"t": T, "s": np.sin(T), "v": np.cos(T), "u": np.sign(np.sin(3 * T))}
 EPISODE = np.repeat([0, 1, 2, 3], 10)

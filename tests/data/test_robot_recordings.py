@@ -6,21 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from systems import CART
 
 from simpel_cli.data import Measurements, read
 from simpel_cli.data.tables.formats import optional
 from simpel_cli.data.tables.formats.topics import Message, sheet_of_topics
 from simpel_cli.data.tables.read_file import read_sheet
 from simpel_cli.errors import DataError
-from simulators.model import Declared
 
-CART = Declared(
-    name="cart",
-    dt=0.1,
-    states={"s": {"unit": "m", "range": [-10, 10]}, "v": {"unit": "m/s", "range": [-5, 5]}},
-    inputs={"u": {"unit": "V", "range": [-2, 2]}},
-    dynamics={"s": "v", "v": "u - v"},
-).model()
 START = 1_700_000_000_000_000_000  # ns
 STEP = 100_000_000
 POINT = "float64 x\nfloat64 y\nfloat64 z\n"

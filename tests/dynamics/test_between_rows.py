@@ -1,6 +1,5 @@
 """Inputs between rows: every integrator agrees with a fine one, held or linear, late, lagged or prompt."""
 
-import ctypes
 import shutil
 import subprocess
 from dataclasses import replace
@@ -136,7 +135,6 @@ def test_the_code_in_c_agrees(tmp_path, monkeypatch) -> None:
     compiled = casadi.external(step.name(), str(tmp_path / "step.so"))
     x, u = np.array([0.3, -0.2]), np.array([1.0, -2.0, 2.5])  # of u: now; then w; then u at the next row
     assert np.allclose(np.asarray(compiled(x, u, [])[0]), np.asarray(step(x, u, [])[0]), atol=1e-14)
-    assert ctypes.CDLL(str(tmp_path / "step.so"))
 
 
 def test_a_word_that_is_none_is_refused() -> None:

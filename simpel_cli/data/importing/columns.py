@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.data.checks.units import read_card
+from simpel_cli.data.tables.formats.csv_header import is_number
 from simpel_cli.data.tables.table import Table
 from simpel_cli.errors import DataError
 
@@ -90,7 +91,7 @@ def _texts(table: Table, name: str, unit: str, fault: str) -> Column:
     except DataError:
         return Column(name, unit, None, ("no numbers and no texts",), ())
     distinct = list(dict.fromkeys(labels[labels != ""].tolist()))
-    numbers = sum(_is_number(text) for text in distinct)
+    numbers = sum(is_number(text) for text in distinct)
     if distinct and numbers > PATIENCE * len(distinct):
         return Column(name, unit, None, ("numbers and texts",), (f"{name} is not read as numbers: {fault}",))
     shown = ", ".join(repr(text) for text in distinct[:3]) + (", ..." if len(distinct) > 3 else "")
@@ -115,11 +116,3 @@ def _jumps(values: np.ndarray, starts: np.ndarray, unit: str) -> str:
     if not large.any() or large.mean() > FEW:
         return ""
     return f"{int(large.sum())} jumps, the largest by {steps.max():.3g}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

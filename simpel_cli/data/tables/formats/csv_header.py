@@ -72,7 +72,7 @@ def are_units(texts: Sequence[str], numeric: Sequence[bool]) -> bool:
         texts: entries of the row.
         numeric: whether the column has numbers, and nothing else, below it.
     """
-    above_numbers = any(number and text and not _is_number(text) for text, number in zip(texts, numeric, strict=True))
+    above_numbers = any(number and text and not is_number(text) for text, number in zip(texts, numeric, strict=True))
     return above_numbers and all(not text or is_unit(bare(text)) for text in texts)
 
 
@@ -96,7 +96,8 @@ def _stem(text: str) -> str:
     return match["name"] if match else ""
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a text is a number with a decimal point."""
     try:
         float(text)
     except ValueError:
