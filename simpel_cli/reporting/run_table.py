@@ -1,10 +1,12 @@
 """The report's table of a run: data used, learned noise and scales, software, time."""
 
 import platform
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from simpel_cli.inference.assemble import Assembled
 from simpel_cli.runs.manifest import Manifest, versions
 from simpel_cli.studies.judgement import Judged
 from simpel_cli.studies.open import Study
@@ -57,12 +59,25 @@ def _kappa(study: Study, fitted: Fitted) -> str:
 
 
 def law_of_noise(study: Study, fitted: Fitted) -> str:
-    """Return the law of the noise, and what it was chosen by."""
-    problems, gain, asked = fitted.assembled.problems, fitted.assembled.heavy_tails, study.measurements.law
+    """Return the law of the noise of a fit, and what it was chosen by."""
+    names = study.system.encoding.y_names
+    return law_in_words(fitted.assembled, study.measurements.law, names, learned=study.method.noise.learn)
+
+
+def law_in_words(assembled: Assembled, asked: str, names: Sequence[str], *, learned: bool) -> str:
+    """Return the law of the noise, and what it was chosen by.
+
+    Args:
+        assembled: problems with the law.
+        asked: data.noise.law.
+        names: of the targets.
+        learned: whether the noise is learned.
+    """
+    problems, gain = assembled.problems, assembled.heavy_tails
     if problems.tail is None:
         if asked == "gaussian":
             return "Gaussian, as data.noise.law says"
-        if not study.method.noise.learn:
+        if not learned:
             return "Gaussian, fixed (method.noise.learn=false)"
         if np.isnan(gain):
             return "Gaussian: too few rows to learn another law from (data.noise.law)"
@@ -70,7 +85,6 @@ def law_of_noise(study: Study, fitted: Fitted) -> str:
         return f"Gaussian: Student's t is {ahead} in leave-one-out log score"
     said = "as data.noise.law says" if asked != "auto" else f"ahead by {gain:.1f} nats of leave-one-out log score"
     freedom = (1 / np.asarray(problems.tail, dtype=float)).mean(axis=0)
-    names = study.system.encoding.y_names
     degrees = ", ".join(f"{name} {value:.2g}" for name, value in zip(names, freedom, strict=True))
     return f"Student's t, {said}; degrees of freedom: {degrees}"
 
