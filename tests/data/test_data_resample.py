@@ -78,3 +78,16 @@ def test_segments_about_as_long_as_the_filter(more: int, dt: float) -> None:
     brought, _, check = resample((tone(0.5, 0.01, seconds=0.01 * rows),), 0.01, dt)
     assert brought == ()
     assert "1 of 1 segments are too short" in check.detail
+
+
+def test_an_input_that_is_linear_between_rows_is_read_where_the_states_are() -> None:
+    """Its value at the new row, not the mean over the interval behind it, which lags by half of one."""
+    raw, dt = 0.01, 0.1
+    episode = tone(0.5, raw)
+    wave = np.sin(np.pi * episode.time)[:, None]
+    episode = episode._replace(inputs=np.concatenate([wave, wave], axis=1))
+    (brought,), _, _ = resample((episode,), raw, dt, linear=(1,))
+    at = np.sin(np.pi * brought.time)
+    inner = slice(2, -2)
+    np.testing.assert_allclose(brought.inputs[inner, 1], at[inner], atol=3e-3)
+    assert np.max(np.abs(brought.inputs[inner, 0] - at[inner])) > 0.1

@@ -227,3 +227,29 @@ def test_what_has_no_networks_of_its_own(tmp_path: Path) -> None:
     assert result.code == 2
     assert "method=sysid has no networks alone that could be written" in result.err
     assert (tmp_path / "fit" / "export" / "simulator.casadi").exists()
+
+
+def test_the_predictor_looks_at_the_next_value_of_an_input_that_is_linear(tmp_path: Path) -> None:
+    """One network, which says what its last input is: u at the next row; after the last row it stays."""
+    from safetensors.numpy import save_file
+
+    from simpel_cli.export.predictor import Predictor
+
+    facts = {
+        "states": [{"name": "w", "unit": "", "angle": False}], "outputs": [], "past_inputs": 0, "next_inputs": ["u"],
+        "inputs": [{"name": n, "unit": ""} for n in ("f", "u")], "negative_slope": 0.01,
+    }  # fmt: skip
+    (tmp_path / "posterior.json").write_text(json.dumps(facts))
+    one = {"y_mean": 1, "y_std": 1, "x_mean": 4, "x_std": 4}
+    arrays = {name: (np.ones if "std" in name else np.zeros)(size) for name, size in one.items()}
+    arrays |= {
+        "noise_std": np.ones(1),
+        "kernel_0": np.array([[[0.0], [0.0], [0.0], [1.0]]]),
+        "bias_0": np.zeros((1, 1)),
+    }
+    save_file(arrays, tmp_path / "posterior.safetensors")
+    predictor = Predictor(tmp_path)
+    commands = [{"f": 9.0, "u": u} for u in (1.0, 2.0, 4.0)]
+    np.testing.assert_allclose(np.diff(predictor.run({"w": 0.0}, commands)[0, :, 0]), [2.0, 4.0, 4.0])
+    assert predictor.step({"w": 0.0}, commands[0]).mean["w"] == 1.0
+    assert predictor.step({"w": 0.0}, commands[0], following={"u": 7.0}).mean["w"] == 7.0

@@ -88,3 +88,11 @@ def test_the_joint_region_of_heavy_tails_holds_what_it_says() -> None:
     share = np.asarray(jax.jit(lambda y: many.share_within(y))(jnp.asarray(y)))
     for level in (0.5, 0.9):
         assert abs((share < level).mean() - level) < 0.03
+
+
+def test_the_share_within_grows_with_the_distance() -> None:
+    y = jnp.asarray(np.array([[0.33, -0.2], [3.0, 20.0]]))
+    many = Predictive(jnp.asarray(np.repeat(PARTICLES, 2, axis=1)), P.noise_scale, P.tail)
+    near, far = np.asarray(many.share_within(y))
+    assert near < 0.1
+    assert far > 0.95

@@ -17,6 +17,7 @@ from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
+from simpel_cli.priors.function_prior import GPPrior
 
 TAIL, OFF = 0.3, 40 * NOISE
 TRUE = 1.2 * X + 0.3
@@ -55,6 +56,29 @@ def test_weights_of_one_are_the_gaussian() -> None:
     same = rule.predict(run(rule, 1), jnp.asarray(GRID))
     np.testing.assert_allclose(same.mean, plain.mean, atol=1e-6)
     np.testing.assert_allclose(same.epistemic_std, plain.epistemic_std, atol=1e-6)
+
+
+def bound(method: Any) -> tuple[Any, Any]:
+    """The rule and its beginning with rows that count by their weights."""
+    problem = problem_of(Y, 0.3)
+    squared = ((problem.y - jnp.asarray(1.2 * problem.x + 0.3)) / NOISE) ** 2
+    problem = problem._replace(tail=jnp.full(1, TAIL), weights=(1 + TAIL) / (1 + TAIL * squared))
+    rule = method.bind(setting_of(prior_of(True)._replace(draws=128)), problem)
+    return rule, rule.init(jax.random.key(0))
+
+
+def test_paths_go_past_the_row_that_is_far_off() -> None:
+    """In closed form, before any network is trained."""
+    _, state = bound(Pathwise(**SMALL | {"particles": 20}, pool=8, features=64, noise=FIXED))
+    at = int(np.argmax(X))
+    assert abs(float(np.mean(np.asarray(state.paths.known)[0, at])) - float(TRUE[at, 0])) < 0.15
+
+
+def test_the_residual_of_a_grey_box_is_scaled_without_it() -> None:
+    """Its scale and the floor of its noise are those of the other rows, not of the one that is far off."""
+    _, state = bound(GreyBox(sysid=SysID(noise=FIXED), residual=FSVGD(**FEW), prior=GPPrior(scale="auto")))
+    assert float(state.noise_floor[0]) < 0.09
+    assert float(state.scale[0]) < 0.04
 
 
 METHODS = {
