@@ -237,7 +237,8 @@ def _queue_or_perform(job: Job) -> Any:
 
 
 def _refuse_failed(outcomes: list[Outcome], root: Path | None) -> None:
-    failed = [o for o in outcomes if o.code]
+    # in the order of the jobs, not in that in which they ended: job 10 after job 9
+    failed = sorted((o for o in outcomes if o.code), key=lambda o: (len(str(o.directory)), str(o.directory)))
     if failed:
         names = "; ".join(f"{os.path.relpath(o.directory, root)}: {o.error}" for o in failed[:5])
         error = SimpelError(f"{len(failed)} of {len(outcomes)} jobs failed, the others are collected. {names}")

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections import Counter
 from pathlib import Path
 
 import grimp
@@ -53,6 +54,12 @@ def test_tests_stand_in_the_rooms_of_the_code() -> None:
     others = {"project"}  # what is shipped, and the whole
     for path in (ROOT / "tests").rglob("test_*.py"):
         assert path.parent.name in rooms | others, path
+
+
+def test_no_two_files_of_tests_have_one_name() -> None:
+    """pytest imports them by their names alone: two of one name are an error of the whole run, not of one file."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 GUIDES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "explanation").glob("life_of_*.md"))]
