@@ -53,7 +53,7 @@ def evaluate(job: Job, screen: Screen) -> None:
     directory, beside = job.directory, {"judged_on": own["data"]} if own.get("data") else {}
     with new_run("evaluate", config, directory, beside=beside) as (declared, manifest):
         study = open_study(declared, run)
-        refuse_changed_inputs(record, study.recording.files)
+        refuse_changed_inputs(record.get("inputs_sha256") or {}, study.recording.files, config)
         step, state, fitted = checkpointed_state(run, prepare(study))
         judged_on = _new_measurements(study, own, job, record) if own.get("data") else study
         manifest.add_inputs(judged_on.recording.files)

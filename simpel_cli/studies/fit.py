@@ -16,7 +16,7 @@ from simpel_cli.runs.metrics import MetricStream
 from simpel_cli.runs.tensorboard import Scalars
 from simpel_cli.studies.declared import declare, resolved
 from simpel_cli.studies.judgement import judge
-from simpel_cli.studies.new_run import kept_run, new_run
+from simpel_cli.studies.new_run import kept_run, new_run, read_into
 from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import STRETCH, Fitted, posteriors, prepare
 from simpel_cli.studies.prior_check import prior_check
@@ -62,7 +62,7 @@ def learned(study: Study, directory: Path, screen: Screen, *, shown: bool = True
     record = read_manifest(directory) if begun else {}
     inputs = record.get("inputs_sha256") or {}
     if record.get("status") == "done":
-        refuse_changed_inputs(record, study.recording.files)
+        refuse_changed_inputs(inputs, study.recording.files, study.declared.config)
         _, state, fitted = checkpointed_state(directory, prepare(study))
         return Learned(study, fitted, state)
     make_directory(directory)
@@ -74,7 +74,7 @@ def learned(study: Study, directory: Path, screen: Screen, *, shown: bool = True
 def _run(study: Study, manifest: Manifest, screen: Screen, *, resume: bool, shown: bool = True) -> Learned:
     directory = manifest.directory
     if resume:
-        refuse_changed_inputs({"inputs_sha256": manifest.inputs}, study.recording.files)
+        refuse_changed_inputs(manifest.inputs, study.recording.files, study.declared.config)
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet or not shown, directory / "run.log")
@@ -109,14 +109,20 @@ def _run(study: Study, manifest: Manifest, screen: Screen, *, resume: bool, show
     return Learned(study, fitted, state)
 
 
-def refuse_changed_inputs(record: dict[str, Any], files: tuple[Path, ...]) -> None:
-    """Compare the measurements with what a run's manifest says that it was trained on.
+def refuse_changed_inputs(inputs: dict[str, str], files: tuple[Path, ...], config: dict[str, Any]) -> None:
+    """Compare the measurements with what a run's manifest says that it was trained on; tables are in its configuration.
+
+    Args:
+        inputs: the files of the run and their SHA-256.
+        files: of the measurements, as they are found today.
+        config: resolved.
 
     Raises:
         DataError: a file is another one now, or there are more or fewer of them (of a pattern in `data.path`), so that the run
             cannot be repeated or gone on with.
     """
-    known = record.get("inputs_sha256") or {}
+    tables = read_into(config)
+    known = {name: digest for name, digest in inputs.items() if name not in tables}
     new = [file for file in files if str(file) not in known and file.suffix != ".yaml"]
     gone = [name for name in known if not Path(name).exists()]
     if (new or gone) and any(

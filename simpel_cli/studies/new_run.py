@@ -38,9 +38,13 @@ def new_run(
     settings = build_settings(config)
     refuse_occupied(make_directory(directory))
     write_text(directory / "config.yaml", dump(config | (beside or {})))
-    tables = {file: digest for key in SIMULATORS for file, digest in files_of(config.get(key)).items()}
-    with Manifest(directory, verb, settings, inputs=tables) as manifest:
+    with Manifest(directory, verb, settings, inputs=read_into(config)) as manifest:
         yield declare(config, settings), manifest
+
+
+def read_into(config: dict[str, Any]) -> dict[str, str]:
+    """Return the files whose numbers a configuration holds, with their SHA-256: a run does not need them again."""
+    return {file: digest for key in SIMULATORS for file, digest in files_of(config.get(key)).items()}
 
 
 class KeptRun(NamedTuple):
