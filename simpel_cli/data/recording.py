@@ -25,7 +25,7 @@ class Check(NamedTuple):
 class Episode(NamedTuple):
     """Contiguous rows at the simulator's dt, float64, physical units, in the simulator's order.
 
-    Angles run on continuously within an episode (they are unwrapped).
+    Angles run on continuously within an episode (they are unwrapped). A state or an output that is missing in a row is NaN.
     """
 
     name: str
@@ -34,6 +34,7 @@ class Episode(NamedTuple):
     inputs: np.ndarray  # (T, n_inputs)
     outputs: np.ndarray  # (T, n_measured_outputs)
     next_states: np.ndarray | None = None  # (T, n_states) where rows do not follow each other (layout: transitions)
+    late: np.ndarray | None = None  # (T, n_states + n_measured_outputs) s, how long before its row a value was measured
 
 
 class Recording(NamedTuple):
