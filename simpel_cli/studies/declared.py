@@ -35,10 +35,15 @@ class Declared(NamedTuple):
 
     @property
     def source(self) -> Source:
-        """The simulator, a symbolic model or a world with query access only; data may say what inputs do between rows."""
+        """The simulator, a symbolic model or a world with query access only.
+
+        Data may say what inputs do between rows, and how late its outputs are recorded, in place of what it says itself.
+        """
         found, data = self.groups["sim"], self.groups.get("data")
         said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
         if isinstance(found, Model):
+            if isinstance(data, Measurements) and data.latency:
+                found = replace(found, latency=data.latency_over(found.latency))
             return replace(found, between_rows=found.between_rows | said) if said else found
         linear = [name for name, word in said.items() if word == "linear"]
         if linear:
