@@ -68,6 +68,7 @@ class Searched(NamedTuple):
         windows: held-out ones.
         recording: the measurements that were searched in, with what was found in them.
         between_rows: input -> what it does between rows, where neither simulator nor data say.
+        degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
     """
 
     search: Search
@@ -78,6 +79,7 @@ class Searched(NamedTuple):
     windows: Windows
     recording: Recording
     between_rows: dict[str, Preference]
+    degrees_of_freedom: dict[str, float]
 
 
 def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
@@ -171,18 +173,21 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
     recording = recording._replace(checks=(*recording.checks, outliers))
-    return Searched(search, assessor, selection, gates, disturbance, windows, recording, between_rows)
+    return Searched(
+        search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom
+    )
 
 
 def _verdict(searched: Searched, before: Assessment, after: Assessment, began: float) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
-    search, assessor, selection, gates, disturbance, windows, recording, between_rows = searched
+    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu = searched
     left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
     seconds = time.perf_counter() - began
     found = verdict_of(
         search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
     )
     found["between_rows"] = {name: p._asdict() for name, p in between_rows.items()}
+    found["degrees_of_freedom"] = nu
     found["steps"] = steps_of(search, selection, assessor, windows)
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}

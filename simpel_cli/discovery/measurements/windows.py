@@ -23,7 +23,7 @@ class Windows(NamedTuple):
 
     Args:
         y: (W, T, ny) measurements, 0 where they do not count.
-        ok: (W, T, ny) how much a measurement counts, up to 1; 0: not at all. Its noise has the variance R/ok.
+        ok: (W, T, ny) how much a measurement counts, 1 as a rule; 0: not at all. Its noise has the variance R/ok.
         u: (W, lead + T, nu) inputs, with `lead` rows of the past in front.
         start: (W, nx) guess of the first state.
         spread: (W, nx) standard deviation of the first state about it.

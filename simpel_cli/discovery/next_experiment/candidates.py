@@ -78,7 +78,7 @@ def reach_of(plan: Setup) -> Reach:
 def rows_of(plan: Setup) -> int:
     """Length of an episode: that of the longest measured one, one window at most."""
     windows = plan.windows
-    lengths = [windows.ok[windows.episode == e].max(axis=2).sum() for e in np.unique(windows.episode)]
+    lengths = [(windows.ok[windows.episode == e] > 0).any(axis=2).sum() for e in np.unique(windows.episode)]
     return int(min(max(lengths), LONGEST))
 
 

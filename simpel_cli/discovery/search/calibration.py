@@ -11,6 +11,7 @@ from simpel_cli.discovery.measurements.cleaning import Cleaned
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.between_rows import Preference, in_words, preferences, settled
 from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.heavy_tails import heavy_tails, weighed
 from simpel_cli.discovery.search.initial_states import begun, moved
 from simpel_cli.discovery.search.outliers import gated, without_new
 from simpel_cli.discovery.search.settings import Discovery
@@ -20,6 +21,7 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
 
+WEIGHINGS = 2  # fits of the simulator with weights from the one before
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
@@ -59,6 +61,7 @@ class Calibrated(NamedTuple):
         test: held-out windows.
         clean: the measurements, without what stands out.
         between_rows: input -> what it does between rows, where neither simulator nor data say.
+        degrees_of_freedom: measured channel -> nu, of those whose noise has heavy tails.
     """
 
     search: Search
@@ -66,6 +69,7 @@ class Calibrated(NamedTuple):
     test: Windows
     clean: Cleaned
     between_rows: dict[str, Preference]
+    degrees_of_freedom: dict[str, float]
 
 
 def calibrated(
@@ -111,9 +115,21 @@ def calibrated(
         cut = after  # the same or not: values that stand out may be in test episodes alone
         if same:
             break
+    tail = heavy_tails(assessor, base.optimum.z, cut["train"])
+    nu = {} if tail is None else {name: float(1 / t) for name, t in zip(names, tail, strict=True) if t > 0}
+    for _ in range(WEIGHINGS if tail is not None else 0):
+        assert tail is not None
+        cut = {split: weighed(assessor, base.optimum.z, windows, tail) for split, windows in cut.items()}
+        search = Search(
+            search.plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), report
+        )
+        base = search.base()
     search.plan = search.plan._replace(spare=cut.get("spare"))
     report("calibrated")
+    if nu:
+        heavy = ", ".join(f"{name} {value:.3g}" for name, value in nu.items())
+        terminal.line(f"Student's t, degrees of freedom: {heavy}; values that lie far off count less", "noise")
     assert between_rows is not None
     if between_rows:
         terminal.line(in_words(between_rows), "inputs")
-    return Calibrated(search, base, cut["test"], clean, between_rows)
+    return Calibrated(search, base, cut["test"], clean, between_rows, nu)

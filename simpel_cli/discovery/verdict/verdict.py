@@ -54,7 +54,7 @@ def verdict_of(
     else:
         kind = EFFECT if all(len(d) == 1 for d in different) else AMBIGUOUS
     measured = search.plan.augmented.measured
-    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
     interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
     found = {
         "verdict": kind,
@@ -95,7 +95,7 @@ def verdict_of(
 def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
     """Return the errors on the test windows after each accepted effect, from the calibrated simulator on."""
     measured = search.plan.augmented.measured
-    rows = max(float(windows.ok.max(axis=2).sum()), 1.0)
+    rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
     steps, before = [], set[int]()
     for trial in selection.path:
         added = [search.terms[t].label for t in trial.terms if t not in before]
