@@ -2,7 +2,8 @@
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,9 +13,9 @@ import jax
 from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
-from simpel_cli.data import Recording
+from simpel_cli.data import Recording, read
 from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.measurements.cleaning import cleaned, outlier_check
+from simpel_cli.discovery.measurements.cleaning import cleaned, outlier_check, without_computed
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
@@ -30,6 +31,8 @@ from simpel_cli.discovery.search.between_rows import (
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
+from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import setup, terms_of
@@ -41,7 +44,7 @@ from simpel_cli.discovery.verdict.evidence import evidence_tables
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
-from simpel_cli.errors import ConfigError, Inconclusive
+from simpel_cli.errors import ConfigError, DataError, Inconclusive
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
 from simpel_cli.runs.files import write_table, write_text
@@ -116,10 +119,15 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
             "effect: none chosen; use effect=[all], or name some, e.g. effect=[coulomb_friction,input_delay]."
         )
     terminal = Terminal(study.settings.quiet, directory / "run.log")
+    latencies = _latencies(study, data_folder, terminal)
+    if latencies:
+        declared = _with_latencies(declared, latencies)
+        study = open_study(declared, data_folder, whole=False)
     searched = _search(study, terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
     found = _verdict(searched, before, after, began)
+    found["latency"] = {name: each._asdict() for name, each in latencies.items()}
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
@@ -132,6 +140,39 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         write_table(directory / f"{name}.parquet", table.columns, table.units)
     publish(terminal, found, directory, declared.config)
     return found
+
+
+def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
+    """Estimate the latencies that the data give by a range, with the simulator as it is."""
+    model, measurements = study.system.source, study.measurements
+    ranges = measurements.latency_ranges()
+    if not ranges:
+        return {}
+    assert isinstance(model, Model)
+    options: Discovery = study.declared.groups.get("discovery") or Discovery()
+    names = [*(q.name for q in model.states), *study.recording.outputs]
+    columns = {name: names.index(name) for name in ranges}
+    longest = {name: high for name, (_, high) in ranges.items()}
+
+    def evidence(at: Mapping[str, float]) -> float:
+        own = replace(measurements, latency=dict(measurements.latency) | dict(at))
+        recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
+        recording = same_readings(recording, columns, at, longest, model.dt)
+        plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
+        width = len(plan.augmented.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
+        fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
+        return float(Search(plan, fitter).base().optimum.log_evidence)
+
+    found = estimated(evidence, ranges, model.dt)
+    terminal.line(in_words_of_latency(found), "latency")
+    return found
+
+
+def _with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
+    """Return the configuration whose data say how late each reading is, so that whatever follows takes it so."""
+    data = declared.config["data"]
+    said = {name: round(each.value, 12) for name, each in found.items()}
+    return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
 
 
 def _search(study: Study, terminal: Terminal) -> Searched:
@@ -231,5 +272,9 @@ def _correct(
         "stack_actions": past_inputs(after.source),
     }
     if config.get("close", True) and len(left_out) < len(found["effects"]):
-        added["as_prior"] = close(declared, after, directory, data_folder, terminal)
+        try:
+            added["as_prior"] = close(declared, after, directory, data_folder, terminal)
+        except DataError as error:  # a fit needs whole rows; what was found stands without it
+            terminal.line(f"no fit with the corrected simulator: {error}", "close")
+            added["not_closed"] = str(error)
     return added

@@ -118,7 +118,11 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         )
     linear = [name for name, said in (found.get("between_rows") or {}).items() if said["word"] == "linear"]
     said = f" 'data.between_rows={{{','.join(f'{name}:linear' for name in linear)}}}'" if linear else ""
-    lines.append(f"simpel fit{own} {what}{said}          # with the declared simulator")
+    late = ",".join(f"{name}:{each['value']:.4g}" for name, each in (found.get("latency") or {}).items())
+    again = f" 'data.latency={{{late}}}'" if late else ""
+    # a fit takes whole rows only, which the estimate seldom is
+    fit = f"simpel discover{own} {what}{again}{said}          # the same, with the latency that was found"
+    lines.append(fit if late else f"simpel fit{own} {what}{said}          # with the declared simulator")
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")
     return lines

@@ -105,8 +105,8 @@ def _simulated(here: Path, folder: Path, case: Case, seed: int) -> Path:
     truth = ", ".join(f"{k}: {v}" for k, v in TRUTH.items())
     made = _simpel(
         here, folder, "simulate", "--config-dir", "my", "sim=cart", f"simulation.episodes={case.episodes}",
-        "simulation.steps=120", f"simulation.seed={seed}", "simulation.noise_std={s: 0.005, v: 0.01}", f"simulation.truth={{{truth}}}",
-        "simulation.initial={s: [-0.2, 0.2], v: [-1, 1]}", *case.simulation, "out=made",
+        "simulation.steps=120", f"simulation.seed={seed}", "simulation.noise_std={s: 0.005, v: 0.01}",
+        f"simulation.truth={{{truth}}}", "simulation.initial={s: [-0.2, 0.2], v: [-1, 1]}", *case.simulation, "out=made",
     )  # fmt: skip
     if made.returncode:
         raise SystemExit(made.stderr)
