@@ -30,9 +30,11 @@ from simpel_cli.discovery.search.between_rows import (
 )
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
+from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
+from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.setup import setup, terms_of
@@ -128,6 +130,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
     found = _verdict(searched, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
+    found["summary"] += sentence_of_latency(latencies)
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
@@ -233,7 +236,7 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, began: f
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
-    found["summary"] += sentence_of(between_rows) + caveats(found)
+    found["summary"] += sentence_of(between_rows) + sentence_of_tails(nu) + caveats(found)
     return found
 
 

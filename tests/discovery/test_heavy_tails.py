@@ -8,6 +8,7 @@ from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.measurements.cleaning import Cleaned
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated
 from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.discovery.search.heavy_tails import sentence_of
 from simpel_cli.discovery.search.setup import Setup, setup
 from simpel_cli.runs.console import Terminal
 from simulators.model import Declared, Model
@@ -64,6 +65,8 @@ def test_student_t_is_noticed_and_no_row_is_lost() -> None:
     _, found = fitted(recording(0, 3.0))
     assert list(found.degrees_of_freedom) == ["v"]
     assert 2 < found.degrees_of_freedom["v"] < 7
+    assert "noise of v (Student's t with" in sentence_of(found.degrees_of_freedom)
+    assert sentence_of({}) == ""
     weight = found.search.plan.windows.ok
     assert np.mean(weight > 0) > 0.99
     assert np.std(weight[..., 1][weight[..., 1] > 0]) > 0.1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.latency import estimated, in_words, same_readings
+from simpel_cli.discovery.search.latency import estimated, in_words, same_readings, sentence_of
 
 
 @pytest.mark.parametrize(("true", "at_end"), [(0.0371, False), (0.2, True)])
@@ -21,6 +21,7 @@ def test_the_best_of_a_curve(true: float, at_end: bool) -> None:
     assert found.at_end is at_end
     assert ("wider" in in_words({"y": found})) is at_end
     assert found.low <= found.value <= found.high
+    assert f"y is recorded {found.value:.3g} s late" in sentence_of({"y": found})
     assert found.gain > 5
     assert len(asked) < 25
     if not at_end:

@@ -12,6 +12,7 @@ Reference: Lange, Little and Taylor (1989), Robust statistical modeling using th
 (1965).
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -82,3 +83,9 @@ def _residuals(assessor: Assessor, z: np.ndarray, windows: Windows) -> Residuals
     counts = windows.ok > 0
     alone = left / np.sqrt(np.maximum(own - there, LEAST_ROOM * own))
     return Residuals(*(np.where(counts, a, np.nan) for a in (alone, (left**2 + there) / variance)))
+
+
+def sentence_of(degrees_of_freedom: Mapping[str, float]) -> str:
+    """Return what a verdict says of noise with heavy tails; nothing where all of it is Gaussian."""
+    heavy = [f"{name} (Student's t with {nu:.2g} degrees of freedom)" for name, nu in degrees_of_freedom.items()]
+    return f" The noise of {' and '.join(heavy)} has heavy tails; values that lie far off count less." if heavy else ""

@@ -122,3 +122,12 @@ def in_words(found: Mapping[str, Latency]) -> str:
         + (", at the end of its range: give a wider one" if each.at_end else "")
         for name, each in found.items()
     )
+
+
+def sentence_of(found: Mapping[str, Latency]) -> str:
+    """Return what a verdict says of them."""
+    said = [
+        f"{name} is recorded {each.value:.3g} s late ({each.low:.3g} to {each.high:.3g} s)"
+        for name, each in found.items()
+    ]
+    return f" {'; '.join(said)}." if said else ""
