@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.filter import Moving, Noise
+from simpel_cli.discovery.likelihood.filter import Moving
+from simpel_cli.discovery.likelihood.track import Noise
 from simpel_cli.discovery.measurements.windows import clocked
 from simpel_cli.discovery.search.setup import Setup, setup
 from simulators.model import Declared, Model

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import Filter, Track
 from simpel_cli.discovery.likelihood.latent_force import Forces, smooth
+from simpel_cli.discovery.likelihood.track import Filter, Track
 from simpel_cli.discovery.measurements.windows import Windows
 
 DT = 0.1

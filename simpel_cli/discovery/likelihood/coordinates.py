@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from simpel_cli.discovery.likelihood.augmented import Augmented
-from simpel_cli.discovery.likelihood.filter import Noise
+from simpel_cli.discovery.likelihood.track import Noise
 
 CUT = 4.0  # standard deviations at which a normal prior is bounded
 

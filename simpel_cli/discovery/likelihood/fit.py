@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Filter, Moving, Noise
+from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Moving
+from simpel_cli.discovery.likelihood.track import Filter, Noise
 from simpel_cli.discovery.measurements.windows import Windows
 
 LEAST_CURVATURE = 12.0

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Filter, Track
+from simpel_cli.discovery.likelihood.filter import MOST_KEPT
+from simpel_cli.discovery.likelihood.track import Filter, Track
 from simpel_cli.discovery.measurements.windows import Windows
 
 CHUNK = 512  # rows of one call of the compiled flow

@@ -15,7 +15,7 @@ import casadi
 import numpy as np
 
 from simpel_cli.discovery.likelihood.augmented import Augmented
-from simpel_cli.discovery.likelihood.filter import Track
+from simpel_cli.discovery.likelihood.track import Track
 from simulators.effects import Term
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Filter, Track
+from simpel_cli.discovery.likelihood.filter import MOST_KEPT
+from simpel_cli.discovery.likelihood.track import Filter, Track
 from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.setup import Setup
 

@@ -8,7 +8,8 @@ import numpy as np
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.likelihood.augmented import Augmented, augment
 from simpel_cli.discovery.likelihood.coordinates import Coordinates, coordinates_of
-from simpel_cli.discovery.likelihood.filter import Filter, filter_of
+from simpel_cli.discovery.likelihood.filter import filter_of
+from simpel_cli.discovery.likelihood.track import Filter
 from simpel_cli.discovery.measurements import windows as windows_
 from simpel_cli.discovery.measurements.integration_steps import substeps_needed
 from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.filter import Track
 from simpel_cli.discovery.likelihood.fit import LEAST_CURVATURE
 from simpel_cli.discovery.likelihood.latent_force import Forces
+from simpel_cli.discovery.likelihood.track import Track
 from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.trials import Search, Trial
 
