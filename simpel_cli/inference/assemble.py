@@ -40,6 +40,7 @@ def assemble(
     keys: list[PRNGKeyArray],
     precision: str,
     law: str = "auto",
+    kept_law: str | None = None,
 ) -> Assembled:
     """Build the problem arrays of every seed.
 
@@ -56,6 +57,7 @@ def assemble(
         keys: one per seed, for draws of the prior that are made here.
         precision: dtype name of the networks.
         law: of the noise: gaussian, student_t, or auto: what the training data say (`priors.noise_law`).
+        kept_law: what `auto` came to when the run began; None: it begins now.
     """
     dtype = jnp.dtype(precision)
     encoding = system.encoding
@@ -68,7 +70,7 @@ def assemble(
     split = [jax.random.split(key) for key in keys]
     chooser = Chooser(prior, bound, system, normaliser, noise, noise_init)
     rows = [(x, y) for (x, _), y in zip(training, targets, strict=True)]
-    choices, gain = chosen(chooser, rows, [key for key, _ in split], law)
+    choices, gain = chosen(chooser, rows, [key for key, _ in split], law, kept_law)
     problems = []
     for (x, y), (_, key), own in zip(rows, split, choices, strict=True):
         m, length = len(x), padded_length(max(len(x), 1))

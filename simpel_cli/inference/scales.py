@@ -112,7 +112,11 @@ class Looked(NamedTuple):
 
 
 def chosen(
-    chooser: Chooser, training: list[tuple[np.ndarray, np.ndarray]], keys: list[PRNGKeyArray], law: str
+    chooser: Chooser,
+    training: list[tuple[np.ndarray, np.ndarray]],
+    keys: list[PRNGKeyArray],
+    law: str,
+    kept: str | None = None,
 ) -> tuple[list[Chosen], float]:
     """Choose scales for every set of training rows, and one law of the noise for all of them.
 
@@ -121,6 +125,7 @@ def chosen(
         training: inputs (m, dx) and normalised targets (m, dy) of every seed.
         keys: one per seed.
         law: of the noise: gaussian, student_t, or auto: what the data say.
+        kept: what `auto` once came to, of a run that began: another machine's rounding does not decide again.
 
     Returns:
         The choices, and the nats by which Student's t is ahead of the Gaussian, per seed; NaN: it was not looked at.
@@ -132,7 +137,8 @@ def chosen(
         )
     looked = [_looked(chooser, x, y, key, law) for (x, y), key in zip(training, keys, strict=True)]
     gain = np.mean([one.gain for one in looked], axis=0).max()
-    if law == "gaussian" or looked[0].moments is None or (law == "auto" and not gain > LEAST_GAIN):
+    heavy = gain > LEAST_GAIN if kept is None else kept == "student_t"
+    if law == "gaussian" or looked[0].moments is None or (law == "auto" and not heavy):
         return [Chosen(one.gap, one.noise, None) for one in looked], float(gain)
     return [_heavy(chooser, one, x, y, key) for one, (x, y), key in zip(looked, training, keys, strict=True)], float(
         gain

@@ -18,7 +18,7 @@ from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import posteriors, prepare
 from simpel_cli.studies.screen import Screen
-from simpel_cli.studies.training import checkpointed_state
+from simpel_cli.studies.training import checkpointed_state, law_kept
 
 CARDS = (".yaml",)  # describe columns; one may lie beside several files
 OWN_SETTINGS = ("quiet", "device", "cache")  # of the group `run`; the others belong to the fit
@@ -54,7 +54,7 @@ def evaluate(job: Job, screen: Screen) -> None:
     with new_run("evaluate", config, directory, beside=beside) as (declared, manifest):
         study = open_study(declared, run)
         refuse_changed_inputs(record.get("inputs_sha256") or {}, study.recording.files, config)
-        step, state, fitted = checkpointed_state(run, prepare(study))
+        step, state, fitted = checkpointed_state(run, prepare(study, law_kept(run)))
         judged_on = _new_measurements(study, own, job, record) if own.get("data") else study
         manifest.add_inputs(judged_on.recording.files)
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}

@@ -21,7 +21,7 @@ from simpel_cli.studies.open import Study, open_study
 from simpel_cli.studies.prepare import STRETCH, Fitted, posteriors, prepare
 from simpel_cli.studies.prior_check import prior_check
 from simpel_cli.studies.screen import Screen
-from simpel_cli.studies.training import checkpointed_state, train
+from simpel_cli.studies.training import checkpointed_state, has_checkpoint, law_kept, train
 
 
 class Learned(NamedTuple):
@@ -63,7 +63,7 @@ def learned(study: Study, directory: Path, screen: Screen, *, shown: bool = True
     inputs = record.get("inputs_sha256") or {}
     if record.get("status") == "done":
         refuse_changed_inputs(inputs, study.recording.files, study.declared.config)
-        _, state, fitted = checkpointed_state(directory, prepare(study))
+        _, state, fitted = checkpointed_state(directory, prepare(study, law_kept(directory)))
         return Learned(study, fitted, state)
     make_directory(directory)
     write_text(directory / "config.yaml", dump(study.declared.config))
@@ -78,7 +78,7 @@ def _run(study: Study, manifest: Manifest, screen: Screen, *, resume: bool, show
     manifest.add_inputs(study.recording.files)
     manifest.facts["device"] = str(study.device)
     terminal = Terminal(study.settings.quiet or not shown, directory / "run.log")
-    fitted = prepare(study)
+    fitted = prepare(study, law_kept(directory) if resume else None)
     checked = prior_check(study, fitted)
     screen.describe(terminal, study, fitted, checked)
     if checked is not None:
@@ -139,6 +139,6 @@ def refuse_changed_inputs(inputs: dict[str, str], files: tuple[Path, ...], confi
 
 def _restored(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitted]:
     """Read the checkpoint, if there is one."""
-    if not (directory / "checkpoint" / "state.safetensors").exists():
+    if not has_checkpoint(directory):
         return 0, None, fitted  # stopped before the first checkpoint: the run starts over, with the same result
     return checkpointed_state(directory, fitted)

@@ -40,8 +40,13 @@ class Fitted(NamedTuple):
         return np.asarray(self.assembled.problems.normaliser.y_std[0], dtype=float)
 
 
-def prepare(study: Study) -> Fitted:
-    """Choose the training transitions of every seed and assemble the problems."""
+def prepare(study: Study, kept_law: str | None = None) -> Fitted:
+    """Choose the training transitions of every seed and assemble the problems.
+
+    Args:
+        study: the declared configuration with its measurements.
+        kept_law: law of the noise in the run's checkpoint; None: there is none yet.
+    """
     settings, measurements = study.settings, study.measurements
     source, encoding = study.system.source, study.system.encoding
     recorded = study.recording.train
@@ -67,6 +72,7 @@ def prepare(study: Study) -> Fitted:
         keys=[stream(seed, "prior") for seed in settings.all_seeds],
         precision=settings.precision,
         law=measurements.law,
+        kept_law=kept_law,
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
     return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)

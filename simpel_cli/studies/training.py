@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from simpel_cli.inference import loop
+from simpel_cli.runs.arrays import load_checkpoint
 from simpel_cli.runs.checkpoint import keep, restored
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.metrics import MetricStream
@@ -72,6 +73,26 @@ def _kept(fitted: Fitted, state: Any) -> dict[str, Any]:
     problems = fitted.assembled.problems
     drawn = {name: getattr(problems, name) for name in DRAWN}
     return {"state": state, "problem": {name: value for name, value in drawn.items() if value is not None}}
+
+
+def law_kept(directory: Path) -> str | None:
+    """Return the law of the noise that a run was trained with; None: it has no checkpoint yet.
+
+    What `data.noise.law: auto` comes to is decided once: near the threshold another machine, which rounds otherwise, might
+    decide the other way, and its problem would have other arrays than the checkpoint.
+
+    Raises:
+        ConfigError: a damaged checkpoint.
+    """
+    if not has_checkpoint(directory):
+        return None
+    leaves, _ = load_checkpoint(directory / "checkpoint")
+    return "student_t" if "['problem']['tail']" in leaves else "gaussian"
+
+
+def has_checkpoint(directory: Path) -> bool:
+    """Whether a run came as far as its first checkpoint."""
+    return (directory / "checkpoint" / "state.safetensors").exists()
 
 
 def checkpointed_state(directory: Path, fitted: Fitted) -> tuple[int, Any, Fitted]:

@@ -24,7 +24,9 @@ SYSTEM = system_of(
 )  # fmt: skip
 
 
-def assembled(rows: int, law: str, *, freedom: float | None = 2.5, learn: bool = True, seeds: int = 1) -> Assembled:
+def assembled(
+    rows: int, law: str, *, freedom: float | None = 2.5, learn: bool = True, seeds: int = 1, kept: str | None = None
+) -> Assembled:
     """Rows of the simulator with noise; the last one is far off."""
     random = np.random.default_rng(1)
     x = random.uniform([-1, -2], [1, 2], (rows, 2))
@@ -35,6 +37,7 @@ def assembled(rows: int, law: str, *, freedom: float | None = 2.5, learn: bool =
     return assemble(
         SYSTEM, normaliser_of(SYSTEM, KEY), SimulatorPrior(), Gaussian(), [(x, y)] * seeds, {"x": SIGMA}, {},
         noise=NoiseModel(learn=learn), pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32", law=law,
+        kept_law=kept,
     )  # fmt: skip
 
 
@@ -49,6 +52,16 @@ def test_the_data_choose_the_law_and_the_run_says_so() -> None:
     assert "Student's t, ahead by" in words(heavy, "auto")
     assert words(light, "auto").startswith("Gaussian: Student's t is")
     assert words(assembled(10, "auto"), "auto").startswith("Gaussian: too few rows")
+
+
+@pytest.mark.parametrize("freedom", [2.5, None], ids=["heavy", "light"])
+def test_what_a_run_began_with_is_not_decided_again(freedom: float | None) -> None:
+    """Nor does it change a number: the other law's arrays are those of a run that began with it."""
+    for law in ("gaussian", "student_t"):
+        kept = assembled(80, "auto", freedom=freedom, kept=law).problems
+        begun = assembled(80, law, freedom=freedom).problems
+        assert (kept.tail is None) == (begun.tail is None) == (law == "gaussian")
+        jax.tree.map(np.testing.assert_array_equal, kept, begun)
 
 
 def test_what_is_asked_for_is_taken() -> None:
