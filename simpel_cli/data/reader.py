@@ -78,7 +78,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     told = values.filled(rows)
     report += [check(told, model, mapping.outputs) for check in (values.constant, values.ranges)]
     groups: dict[str, tuple[str, ...]] = {}
-    if isinstance(model, Model) and model.per:
+    if isinstance(model, Model) and model.columns_of_groups:
         groups = known or group_names(model, table, rows)
         rows = with_groups(rows, table, groups)
     if config.layout == "transitions":

@@ -35,11 +35,14 @@ class Declared(NamedTuple):
 
     @property
     def source(self) -> Source:
-        """The simulator, a symbolic model or a world with query access only; data may say what inputs do between rows."""
+        """The simulator, a symbolic model or a world with query access only.
+
+        Data may say what inputs do between rows, effects and `discovery` which columns name groups.
+        """
         found, data = self.groups["sim"], self.groups.get("data")
         said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
         if isinstance(found, Model):
-            return replace(found, between_rows=found.between_rows | said) if said else found
+            return replace(found, between_rows=found.between_rows | said, asked=self._columns_of_groups)
         linear = [name for name, word in said.items() if word == "linear"]
         if linear:
             raise ConfigError(
@@ -47,6 +50,13 @@ class Declared(NamedTuple):
                 "its inputs. Give held, or a simulator in symbols."
             )
         return found
+
+    @property
+    def _columns_of_groups(self) -> dict[str, str]:
+        """Columns of groups that effects or `discovery` name, each with the key that does."""
+        effects = {e.per: f"effect.{e.name}.per" for e in self.groups.get("effect") or () if e.per}
+        options = self.groups.get("discovery")
+        return dict.fromkeys(options.groups if options else (), "discovery.groups") | effects
 
     @property
     def measurements(self) -> Measurements:
