@@ -119,6 +119,7 @@ class Model:
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
         saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
             is not, as what is measured of it is.
+        latency: measured output -> how old a value is when it is recorded, s; no equation depends on it.
         coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
@@ -146,6 +147,7 @@ class Model:
     base: "Model | None" = None
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
+    latency: dict[str, float] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
 
@@ -234,9 +236,10 @@ class Declared:
         tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
             intermediates, whose value is looked up (see `simulators.tables`).
         dynamics: state: expression of its time derivative, in all these names.
-        outputs: name: expression, or {unit, expression, scale, bias, saturates: [low, high], lag, range}; a measured quantity
-            that is not a state. The reading is scale*expression + bias within `saturates` (null: no end); with `lag` (s) it
-            follows as a first-order lag does, and is a state of the model by this name, with this `range`.
+        outputs: name: expression, or {unit, expression, scale, bias, saturates: [low, high], lag, range, delay}; a measured
+            quantity that is not a state. The reading is scale*expression + bias within `saturates` (null: no end); with `lag`
+            (s) it follows as a first-order lag does, and is a state of the model by this name, with this `range`. `delay` (s)
+            says how old a reading is when it is recorded, as data.latency does.
         gap: state or output: expected model error of one transition, in its unit.
 
     Example:
@@ -328,6 +331,7 @@ class Declared:
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },
             saturation={name: sensor.ends for name, sensor in sensors.items() if sensor.saturates},
+            latency={name: sensor.delay for name, sensor in sensors.items() if sensor.delay},
             coordinates=self.own_coordinates(known),
             symbol=self.symbol,
         )

@@ -90,6 +90,8 @@ def either(*options: Schema) -> Schema:
     return {"anyOf": list(options)}
 
 
+_OUTPUT = keys(SENSOR, ("expression",))
+_OUTPUT["properties"]["delay"] = NUMBER | {"description": "How old a reading is when it is recorded, s."}
 _PARAMETER = {"required": ["range"]}, {"required": ["value"]}
 PARAMETER = either(TERM, keys(dict.fromkeys((*UNCERTAIN, *KNOWN, *COVARIATE))) | {"anyOf": list(_PARAMETER)})
 GAP = named(NUMBER)
@@ -101,6 +103,6 @@ SECTIONS: dict[str, Schema] = {
     "intermediates": named(either(TERM, keys(INTERMEDIATE, ("expression",)))),
     "tables": named(keys(TABLE, ("inputs",))),
     "dynamics": named(TERM),
-    "outputs": named(either(TERM, keys(SENSOR, ("expression",)))),
+    "outputs": named(either(TERM, _OUTPUT)),
     "gap": GAP,
 }

@@ -1,4 +1,4 @@
-"""Sensors of a declared simulator: what is read in place of an output, with scale, bias, limits and a lag."""
+"""Sensors of a declared simulator: what is read in place of an output, with scale, bias, limits, a lag and a delay."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -22,12 +22,12 @@ from simulators.quantity import (
     refuse_unknown,
 )
 
-KEYS = ("unit", "expression", "scale", "bias", "saturates", "lag", "range")
+KEYS = ("unit", "expression", "scale", "bias", "saturates", "lag", "range", "delay")
 LEAST_LAG = 0.5  # Runge-Kutta steps: a third is where they begin to diverge
 
 
 class Sensor(NamedTuple):
-    """An output and how it is read: scale*expression + bias, within its ends, later if there is a lag.
+    """An output and how it is read: scale*expression + bias, within its ends, later if there is a lag or a delay.
 
     Args:
         quantity: name, unit, and the range of a lagging one.
@@ -36,6 +36,7 @@ class Sensor(NamedTuple):
         scale, bias: a number or the name of a parameter.
         ends: lowest and highest reading.
         lag: time constant, s, or the name of a parameter; None: the reading follows at once.
+        delay: s, how long a reading takes to the record. It changes no equation: measurements are read for it.
     """
 
     quantity: Quantity
@@ -45,6 +46,7 @@ class Sensor(NamedTuple):
     bias: float | str
     ends: tuple[float, float]
     lag: float | str | None
+    delay: float
 
     @property
     def saturates(self) -> bool:
@@ -66,7 +68,7 @@ class Sensor(NamedTuple):
 def read_sensors(
     nodes: Mapping[str, Any], parameters: Iterable[str], least: Mapping[str, float], step: float
 ) -> dict[str, Sensor]:
-    """Read `outputs`: an expression, or {unit, expression, scale, bias, saturates, lag, range}.
+    """Read `outputs`: an expression, or {unit, expression, scale, bias, saturates, lag, range, delay}.
 
     Args:
         nodes: by name.
@@ -143,9 +145,23 @@ def _read(path: str, name: str, node: Any, parameters: list[str], least: Mapping
         span = read_range(path, own)
     elif "range" in own:
         raise ModelError(f"{path}.range: an output without a lag is no state and has no range; leave it out")
+    quantity = Quantity(name, read_unit(path, own), *span)
     return Sensor(
-        Quantity(name, read_unit(path, own), *span), path, read_expression(path, node), scale, bias, ends, lag
+        quantity, path, read_expression(path, node), scale, bias, ends, lag, _read_delay(f"{path}.delay", name, own)
     )
+
+
+def _read_delay(path: str, name: str, node: Mapping[str, Any]) -> float:
+    given = node.get("delay", 0.0)
+    if isinstance(given, str) and given.isidentifier() and given not in CONSTANTS:
+        raise ModelError(
+            f"{path}: {given!r} is no number; give the delay of the sensor in s. If it is not known, leave it out and give "
+            f"its range to `simpel discover`: data.latency: {{{name}: [low, high]}}"
+        )
+    seconds = read_number(path, given)
+    if seconds < 0:
+        raise ModelError(f"{path}: {seconds:g} s is negative; a value cannot be recorded before it is measured")
+    return seconds
 
 
 def _number_or_name(path: str, node: Mapping[str, Any], key: str, start: float, parameters: list[str]) -> float | str:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from simpel_cli.data.timing.keys import JOIN, LATENCY, Join, read_join, read_latency, read_times
 from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.quantity import BETWEEN_ROWS
 
@@ -11,6 +12,10 @@ LAYOUTS = ("trajectories", "transitions")
 CHOICES = ("random", "first")
 LAWS = ("auto", "gaussian", "student_t")
 SPLIT_BY = ("episode", "time")
+OF_INPUTS = {  # what to do where one is named
+    "latency": "only states and outputs are recorded late. One that acts late is sim.inputs.{0}.delay.",
+    "times": "the times of inputs are those of the rows, data.time. Only states and outputs have clocks of their own.",
+}
 SPLIT_DEFAULT: dict[str, Any] = {"test_fraction": 0.25, "by": "episode"}
 
 
@@ -54,6 +59,14 @@ class Measurements:
             position: `discover` does not take them for measurements. A plain difference is found without this.
         between_rows: input -> `held` at the value of its row until the next, or `linear`, straight to the value of the next
             row; in place of what the simulator says. Held where neither says anything (`discover` then compares both).
+        latency: state or output -> how old its value is when it is recorded, s: in a row at t is what was measured at
+            t - latency. In place of `sim.outputs.y.delay`. Or [low, high]: `discover` estimates it.
+        times: state or output -> column of the time at which it was measured, s, of a sensor with a clock of its own: its
+            values belong to the row at or after that time. Needs `time`.
+        join: tables of other sensors, `{path, time, columns, episode}` each: their values belong to the row of `path` at or
+            after their `time` (s, on the same clock). `columns`: those that are taken; left out: all that `path` does not
+            have. `episode`: column of the names that `data.episode` has, too; left out: the column of that name, or by time
+            alone. Needs `time`; inputs come from `path`.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
@@ -78,6 +91,9 @@ class Measurements:
     max_gap: float | int | None = None
     derived: tuple[str, ...] = ()
     between_rows: Mapping[str, str] = field(default_factory=dict)
+    latency: Mapping[str, Any] = field(default_factory=dict)
+    times: Mapping[str, str] = field(default_factory=dict)
+    join: tuple[Mapping[str, Any], ...] = ()
 
     sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields whose type says too little
         "layout": {"enum": list(LAYOUTS)},
@@ -95,6 +111,8 @@ class Measurements:
         },
         "noise": {"type": "object", "properties": {"law": {"enum": list(LAWS)}}, "additionalProperties": False},
         "between_rows": {"type": "object", "additionalProperties": {"enum": list(BETWEEN_ROWS)}},
+        "latency": LATENCY,
+        "join": JOIN,
     }
 
     def __post_init__(self) -> None:
@@ -117,6 +135,9 @@ class Measurements:
         for name, word in self.between_rows.items():
             _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
         _check_split(self.split)
+        read_latency(self.latency)
+        read_times(self.times, self.time)
+        _ = self.joined
         if self.layout == "transitions" and self.stack_actions:
             raise ConfigError(
                 f"data.stack_actions: {self.stack_actions} past inputs are not known in layout 'transitions', whose "
@@ -140,6 +161,23 @@ class Measurements:
     def paths(self) -> tuple[str, ...]:
         """The files, one or several."""
         return (self.path,) if isinstance(self.path, str) else tuple(self.path)
+
+    @property
+    def joined(self) -> tuple[Join, ...]:
+        """The tables of other sensors."""
+        return read_join(self.join, self.time)
+
+    def known_latency(self) -> dict[str, float]:
+        """Return how old the values of a column are when they are recorded, s, where it is a number."""
+        return {name: value for name, value in read_latency(self.latency).items() if isinstance(value, float)}
+
+    def latency_ranges(self) -> dict[str, tuple[float, float]]:
+        """Return between which ends that is, s, where it is to be estimated."""
+        return {name: value for name, value in read_latency(self.latency).items() if isinstance(value, tuple)}
+
+    def latency_over(self, latency: Mapping[str, float]) -> dict[str, float]:
+        """Return the known latencies of a simulator and of these data, s, which precede; a range takes one away."""
+        return {name: s for name, s in latency.items() if name not in self.latency} | self.known_latency()
 
     @property
     def law(self) -> str:
@@ -166,10 +204,16 @@ class Measurements:
             ("noise_std", self.noise_std, measurable),
             ("derived", self.derived, measurable),
             ("between_rows", self.between_rows, tuple(name for name in quantities if name not in measurable)),
+            ("latency", self.latency, measurable),
+            ("times", self.times, measurable),
         ):
             for name in names:
                 if name not in allowed:
-                    what = "input" if key == "between_rows" else "quantity"
+                    if key in OF_INPUTS and name in quantities:
+                        raise ConfigError(f"data.{key}.{name}: {name} is an input; {OF_INPUTS[key].format(name)}")
+                    what = {"between_rows": "input", "latency": "state or output", "times": "state or output"}.get(
+                        key, "quantity"
+                    )
                     raise ConfigError(
                         f"data.{key}.{name}: the simulator has no such {what} (it has: {', '.join(allowed)})."
                         + did_you_mean(name, list(allowed))

@@ -15,17 +15,21 @@ from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
 from simpel_cli.data.groups import group_names, with_groups
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
-from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns
+from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns, named_episodes
 from simpel_cli.data.split import PARTS, assign
-from simpel_cli.data.tables.column_names import with_short_names
+from simpel_cli.data.tables.column_names import with_names_of_joined, with_short_names
 from simpel_cli.data.tables.locate import by_file, locate
 from simpel_cli.data.tables.table import read_table
 from simpel_cli.data.time_gaps import cut_at_gaps
+from simpel_cli.data.timing.joined_tables import read_joined
+from simpel_cli.data.timing.when_measured import refuse_unplaced, when_measured
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
 
 
-def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True) -> Recording:
+def read(
+    config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True, partial: bool | None = None
+) -> Recording:
     """Read measurements for a simulator.
 
     Args:
@@ -35,6 +39,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         seed: of the run; `config.seed` wins.
         whole: every state is needed in every row, so refuse one that is not measured and cannot be estimated; else it
             stays NaN.
+        partial: rows may lack values, and values may be measured before their row (`Episode.late`); None: unless `whole`.
 
     Returns:
         Checked episodes, at least one each to train and to test on, unless the data YAML keeps none to test on.
@@ -63,15 +68,23 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
     table = read_table(tuple(file.path for file in found), [file.named for file in found])
     config = with_short_names(config, table, tuple(q.name for q in model.outputs))
     table = with_computed(table, config.computed)
-    mapping = map_columns(config, model, table)
+    joined = read_joined(config, table, base)
+    config = with_names_of_joined(config, [other.table for other in joined], table)
+    mapping = map_columns(config, model, table, joined)
+    refuse_unplaced(config, model, mapping)
     dynamic = bool(model.states) and config.layout == "trajectories"
 
-    units, cards = check_units(config, table, mapping.columns, quantities)
-    report = [Check("files", True, "; ".join(table.notes)), units] if table.notes else [units]
+    units, cards = check_units(config, table, mapping.columns, quantities, joined, mapping.joined)
+    notes = [note for each in (table, *(other.table for other in joined)) for note in each.notes]
+    report = [Check("files", True, "; ".join(notes)), units] if notes else [units]
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     rows = arrange(config, model, table, mapping)
     # the filter of `discover` takes a row as it is; brought to another dt it has to be complete
-    partial = not whole and dynamic and config.resample is None
+    partial = (not whole if partial is None else partial) and dynamic and config.resample is None
+    rows, when = when_measured(
+        config, model, rows, table, mapping, joined, named_episodes(config, table, rows), partial=partial
+    )
+    report += [when] if when is not None else []
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
@@ -87,7 +100,7 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         computed: tuple[str, ...] = config.derived
     else:
         report.append(clock.monotonic(rows, table, config))
-        parts, noise, more, computed = _trajectories(config, model, rows, mapping, whole)
+        parts, noise, more, computed = _trajectories(config, model, rows, mapping, whole, partial=partial)
         report += more
     for part, episodes in parts.items():
         if not episodes and not (part == "test" and config.all_train):
@@ -99,33 +112,36 @@ def read(config: Measurements, model: Source, base: Path, seed: int, *, whole: b
         noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
         estimated=mapping.unmeasured,
         checks=tuple(report),
-        files=(*table.files, *cards),
+        files=tuple(dict.fromkeys((*table.files, *(f for other in joined for f in other.table.files), *cards))),
         derived=tuple(name for name in computed if name in mapping.columns),
         groups=groups,
     )
 
 
 def _trajectories(
-    config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool
+    config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool, *, partial: bool
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
     """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
-    sampling, raw = clock.sampling(rows, model, config)
-    cut, starts = cut_at_gaps(rows, raw, config)
+    sampling, raw, longest = clock.sampling(rows, model, config, as_they_are=partial)
+    cut, starts = cut_at_gaps(rows, longest, config)
     tagged = _segments(model, rows, starts)
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     there = values.complete(rows, measured)
     if there.all():
-        faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw)
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw, partial)
     elif there.sum() > len(there) / 2:  # faults of sensors show in rows that follow each other
         alone = rows.take(there)
-        pieces = _segments(model, alone, cut_at_gaps(alone, raw, config)[1])
-        faults, computed = _sensors(config, model, mapping, [episode for _, episode in pieces], raw)
+        pieces = _segments(model, alone, cut_at_gaps(alone, longest, config)[1])
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in pieces], raw, partial)
     else:
-        faults, computed = [], config.derived
+        faults, computed = _sensors(
+            config, model, mapping, [episode for _, episode in tagged], raw, partial, together=False
+        )
     report = [sampling, cut, *faults]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
     of_slope: dict[str, tuple[str, float]] = {}
-    if mapping.unmeasured and there.all():
+    at_rows = rows.late.shape[1] == 0
+    if mapping.unmeasured and there.all() and at_rows:
         episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
@@ -146,25 +162,40 @@ def _trajectories(
 
 
 def _sensors(
-    config: Measurements, model: Source, mapping: Mapping, segments: list[Episode], dt: float
+    config: Measurements,
+    model: Source,
+    mapping: Mapping,
+    segments: list[Episode],
+    dt: float,
+    partial: bool,
+    *,
+    together: bool = True,
 ) -> tuple[list[Check], tuple[str, ...]]:
-    """Faults of the sensors and the clock, of the rows as they were measured, and columns that are no measurement."""
+    """Faults of the sensors and the clock, of the rows as they were measured, and columns that are no measurement.
+
+    Where sensors do not speak `together`, every column is tested by its own values, one after another, none against another.
+    """
+
+    def there(values: np.ndarray) -> np.ndarray:
+        return values if together else values[np.isfinite(values)]
+
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
     columns = {
-        q.name: [np.concatenate([s.states, s.outputs], axis=1)[:, i] for s in segments]
+        q.name: [there(np.concatenate([s.states, s.outputs], axis=1)[:, i]) for s in segments]
         for i, q in enumerate(observed)
         if q.name in mapping.columns
     }
     units = {q.name: q.unit for q in observed}
     times = [segment.time for segment in segments]
+    together &= all(segment.late is None for segment in segments)
     motions = [
         Motion(p, v, units[v], list(zip(times, columns[p], columns[v], strict=True)))
         for v, positions in speeds(model).items()
         for p in positions
-        if p in columns and v in columns
+        if p in columns and v in columns and together
     ]
     found = [
-        sensors.jitter(times, dt, model.dt if config.resample is None else None),
+        sensors.jitter(times, dt, model.dt if config.resample is None else None, as_they_are=partial),
         sensors.stale(columns),
         sensors.quantisation(columns, units),
         kinematics(motions),
@@ -187,9 +218,17 @@ def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, 
             states=_unwrap(rows.states[begin:end], model.states),
             inputs=rows.inputs[begin:end],
             outputs=rows.outputs[begin:end],
+            late=_late(rows.take(np.arange(begin, end))),
         )
         segments.append((str(rows.split[begin]), segment))
     return segments
+
+
+def _late(rows: Rows) -> np.ndarray | None:
+    """How long before its row each value was measured, (T, n_states + n_outputs) s; None: every value at its row."""
+    if not rows.late.shape[1]:
+        return None
+    return np.where(np.isfinite(np.concatenate([rows.states, rows.outputs], axis=1)), rows.late, 0.0)
 
 
 def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[Episode, ...]:

@@ -1,5 +1,6 @@
 """The columns of a file under the simulator's names and in its order, before anything is cut or resampled."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Source
 from simpel_cli.data.tables.table import Table
+from simpel_cli.data.timing.joined_tables import Joined
 from simpel_cli.errors import DataError
 from simulators.model import Model
 
@@ -23,6 +25,9 @@ class Rows(NamedTuple):
     inputs: np.ndarray  # (n, n_inputs)
     outputs: np.ndarray  # (n, n_measured_outputs)
     next_states: np.ndarray  # (n, n_states) in layout transitions, else (n, 0)
+    late: (
+        np.ndarray
+    )  # (n, n_states + n_measured_outputs) s, how long before its row a value was measured; (n, 0): none was
 
     def take(self, chosen: np.ndarray) -> "Rows":
         """Rows chosen by a mask or by indices."""
@@ -35,19 +40,28 @@ class Mapping(NamedTuple):
     columns: dict[str, str]  # measured quantity -> column
     outputs: tuple[str, ...]  # measured outputs
     unmeasured: tuple[str, ...]  # states
+    joined: dict[str, int] = {}  # noqa: RUF012  measured quantity -> which of the joined tables has its column
 
 
-def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
+def map_columns(config: Measurements, model: Source, table: Table, joined: Sequence[Joined] = ()) -> Mapping:
     """Find the column of every quantity.
 
     An output without a column is left out; a state can be declared as not measured; inputs must be there.
+
+    Args:
+        config: the data YAML.
+        model: its quantities.
+        table: of `data.path`.
+        joined: tables of other sensors; a column that one of them names is taken from there.
 
     Raises:
         DataError: a column is missing, an input is declared as not measured, or nothing is measured.
     """
     states, inputs, outputs = ([q.name for q in group] for group in (model.states, model.inputs, model.outputs))
     known = model.covariates if isinstance(model, Model) else {}
+    home = {column: i for i, other in enumerate(joined) for column in other.columns}
     columns: dict[str, str] = {}
+    elsewhere: dict[str, int] = {}
     for name in [*states, *inputs, *outputs]:
         column = config.columns.get(name, known.get(name, name))
         if column is None and name in inputs:
@@ -55,6 +69,11 @@ def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
                 f"data.columns.{name}: an input cannot be estimated, it must be measured. "
                 f"Name its column: `columns: {{{name}: <name>}}`."
             )
+        if column in home and (name not in inputs or column not in table.columns):
+            if name in inputs:
+                raise _input_elsewhere(name, column, joined[home[column]], table)
+            columns[name], elsewhere[name] = column, home[column]
+            continue
         if column is None or (name in outputs and name not in config.columns and column not in table.columns):
             continue
         if column not in table.columns:
@@ -76,7 +95,14 @@ def map_columns(config: Measurements, model: Source, table: Table) -> Mapping:
             f"nothing of {table.name} is measured: no column for any of {', '.join([*states, *outputs])}. "
             f"Say `columns: {{{[*states, *outputs, 'name'][0]}: <name>}}`."
         )
-    return Mapping(columns, measured_outputs, unmeasured)
+    return Mapping(columns, measured_outputs, unmeasured, elsewhere)
+
+
+def _input_elsewhere(name: str, column: str, joined: Joined, table: Table) -> DataError:
+    return DataError(
+        f"column '{column}' of the input {name} is in {joined.table.name} ({joined.key}), but what the inputs are has to be "
+        f"known in every row. Make that table the main one (data.path) and join {table.name}."
+    )
 
 
 def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping) -> Rows:
@@ -102,7 +128,13 @@ def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping)
         inputs=_stack(n, [_numbers(table, mapping, q.name) for q in model.inputs]),
         outputs=_stack(n, [_numbers(table, mapping, name) for name in mapping.outputs]),
         next_states=_stack(n, following),
+        late=np.empty((n, 0)),
     ).take(order)
+
+
+def named_episodes(config: Measurements, table: Table, rows: Rows) -> np.ndarray | None:
+    """Name that the file gives the episode of every row, (n,) text; None: it gives none."""
+    return None if config.episode is None else _labels(table, config.episode, "data.episode")[rows.number]
 
 
 def split_labels(config: Measurements, table: Table, column: str) -> np.ndarray:
@@ -155,7 +187,7 @@ def _by_episode(episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _numbers(table: Table, mapping: Mapping, name: str) -> np.ndarray:
-    column = mapping.columns.get(name)
+    column = None if name in mapping.joined else mapping.columns.get(name)
     return table.numbers(column) if column is not None else np.full(len(table), np.nan)
 
 

@@ -16,7 +16,7 @@ def cut_at_gaps(rows: Rows, dt: float, config: Measurements) -> tuple[Check, np.
 
     Args:
         rows: checked for NaN.
-        dt: of the data, s.
+        dt: of the data, s; of irregular rows the longest usual step.
         config: `max_gap`, s; null = 1.5 steps, of the data or of what they are resampled to.
 
     Returns:

@@ -243,9 +243,11 @@ def _end(value: float) -> str:
 
 
 def _given(name: str, model: Any) -> str:
-    """Say what an input does between rows, or which column knows it; nothing of others."""
+    """Say what an input does between rows, which column knows it, or how late an output is recorded; nothing of others."""
     column = getattr(model, "covariates", {}).get(name)
     word = getattr(model, "between_rows", {}).get(name)
+    if late := getattr(model, "latency", {}).get(name):
+        return f"recorded {late:g} s after it is measured"
     if by := getattr(model, "per", {}).get(name):
         return f"differs per {by}"
     return f"known in every row: column {column}" if column else f"{word} between rows" if word else ""

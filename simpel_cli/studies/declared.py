@@ -37,12 +37,16 @@ class Declared(NamedTuple):
     def source(self) -> Source:
         """The simulator, a symbolic model or a world with query access only.
 
-        Data may say what inputs do between rows, effects and `discovery` which columns name groups.
+        Data may say what inputs do between rows, and how late its outputs are recorded, in place of what it says itself;
+        effects and `discovery` say which columns name groups.
         """
         found, data = self.groups["sim"], self.groups.get("data")
         said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
         if isinstance(found, Model):
-            return replace(found, between_rows=found.between_rows | said, asked=self._columns_of_groups)
+            late = (
+                data.latency_over(found.latency) if isinstance(data, Measurements) and data.latency else found.latency
+            )
+            return replace(found, between_rows=found.between_rows | said, latency=late, asked=self._columns_of_groups)
         linear = [name for name, word in said.items() if word == "linear"]
         if linear:
             raise ConfigError(

@@ -74,7 +74,8 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     """
     # the past inputs of the fit, where the new data do not say otherwise
     data = {"stack_actions": study.measurements.stack_actions} | own["data"]
-    data["between_rows"] = dict(study.measurements.between_rows) | (data.get("between_rows") or {})
+    for key in ("between_rows", "latency"):  # as the rig was, where the new data do not say otherwise
+        data[key] = dict(getattr(study.measurements, key)) | (data.get(key) or {})
     choices = study.choices | {"data": own["choices"].get("data", "")}
     declared = study.declared._replace(config=study.declared.config | {"choices": choices})
     other = _opened_whole(declared, data, job.data_folder, study.recording.groups)

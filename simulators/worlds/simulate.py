@@ -76,7 +76,7 @@ class Simulate:
         quantisation: state or output -> step of its converter, in its unit; it rounds after the noise.
         saturates: state or output -> lowest and highest value that its sensor records; null = no end.
         missing: state or output -> share of its cells that are NaN, drawn cell by cell.
-        latency: state or output -> how old a value is when it is recorded, s. The rows begin later by the longest one.
+        latency: state or output -> age of a value when it is recorded, s, or as the simulator says; rows begin later by it.
         rates: state or output -> s between two samples of its sensor; NaN in the rows between.
         clocks: state or output -> its sensor samples at times of its own: {offset, drift}. They become rows.
         jitter: share of dt by which the times of rows vary at random.
@@ -140,8 +140,9 @@ class Simulate:
             ModelError: a name that the source does not have, a range upside down, or a state that is not finite.
 
         """
-        if isinstance(source, Model) and source.between_rows.keys() - self.between_rows.keys():
-            return dataclasses.replace(self, between_rows=source.between_rows | self.between_rows).run(source)
+        for key in ("between_rows", "latency"):  # the simulator may say them, too
+            if (own := getattr(source, key, {})).keys() - getattr(self, key).keys():
+                return dataclasses.replace(self, **{key: own | getattr(self, key)}).run(source)
         own = OWN_COLUMNS if self.layout == "trajectories" else OWN_COLUMNS[-1:]
         for quantity in (*source.states, *source.inputs, *source.outputs):
             if quantity.name in own:
@@ -207,16 +208,17 @@ class Simulate:
                 if source.states
                 else (f"{source.name} has no states, so its rows have no time", "take a simulator with states")
             )
+            for name in getattr(source, "latency", {}):
+                raise ModelError(f"sim.outputs.{name}.delay: {why}; set it to 0, or {cure}")
             for key, given in ({k: getattr(self, k) for k in ("latency", "rates", "clocks")} | in_time).items():
                 if given:
                     raise ModelError(f"simulation.{key}: {why}; leave it out, or {cure}")
         if not isinstance(source, Model):
-            for key, given in in_time.items():
-                if given:
-                    raise ModelError(
-                        f"simulation.{key}: {source.name} is a world, which answers from row to row with held inputs and "
-                        "constant parameters; leave it out, or take a simulator with equations"
-                    )
+            for key in (each for each, given in in_time.items() if given):
+                raise ModelError(
+                    f"simulation.{key}: {source.name} is a world, which answers from row to row with held inputs and "
+                    "constant parameters; leave it out, or take a simulator with equations"
+                )
         elif late := [name for name in source.delay.values() if name in self.drift]:
             raise ModelError(f"simulation.drift.{late[0]}: it is a delay of an input, which cannot drift; leave it out")
 
@@ -394,6 +396,5 @@ def _bare(column: str, known: Iterable[str]) -> str:
 
 def _known(key: str, given: Iterable[str], quantities: tuple[Quantity, ...]) -> None:
     names = [quantity.name for quantity in quantities]
-    for name in given:
-        if name not in names:
-            refuse_unknown(f"simulation.{key}.{name}", "no such name", name, names)
+    for name in (each for each in given if each not in names):
+        refuse_unknown(f"simulation.{key}.{name}", "no such name", name, names)

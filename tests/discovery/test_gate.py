@@ -38,7 +38,9 @@ def windows_of(episode: Sequence[int], first: int) -> Windows:
     count = len(episode)
     y = np.zeros((count, 9, 1))
     begin = np.arange(first, first + count)
-    return Windows(y, y + 1, y, np.zeros((count, 1)), np.ones((count, 1)), np.array(episode), begin)
+    return Windows(
+        y, y + 1, y, np.zeros((count, 1)), np.ones((count, 1)), np.array(episode), begin, np.zeros((*y.shape[:2], 0))
+    )
 
 
 class Fits:

@@ -154,6 +154,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
         louder=pytest.fail,
         flow=lambda p, x, u: a @ x + b + 0.0 * p[0] + 0.0 * jnp.sum(u),
         measure=lambda p, x, u: x,
+        read=lambda p, before, u_before, x, u: x,
         delayed_inputs=lambda p, u: u[:, None, None, :],
     )
     known = np.array([False])
@@ -161,7 +162,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
     rows = len(y)
     windows = Windows(
         y=y[None], ok=np.isfinite(y[None]) * 1.0, u=np.zeros((1, rows, 1)), start=system.m[None], spread=np.ones((1, len(b))),
-        episode=np.zeros(1, int), begin=np.zeros(1, int),
+        episode=np.zeros(1, int), begin=np.zeros(1, int), clock=np.zeros((1, rows, 0)),
     )  # fmt: skip
     return Forces(rule, coordinates, DT)(np.zeros(1), system.track(y), windows)
 

@@ -27,7 +27,7 @@ def episode(name: str, rows: int, begin: float = 0.0) -> Episode:
 
 
 EPISODES = (episode("a", 23), episode("b", 9, 5.0))
-WINDOWS = windows_of(EPISODES, ["x"], ["x"], [], np.zeros(1), np.ones(1), lead=LEAD, longest=10)
+WINDOWS = windows_of(EPISODES, ["x"], ["x"], [], np.zeros(1), np.ones(1), lead=LEAD, dt=0.1, longest=10)
 
 
 def assessment(one_step: Any, ahead: Any = None, free: Any = None) -> Assessment:

@@ -33,7 +33,7 @@ def cut(lengths: list[int]) -> Windows:
         Episode(f"{i}", np.arange(n) * 0.1, np.arange(n)[:, None] + 1000.0 * i, np.zeros((n, 1)), np.zeros((n, 0)))
         for i, n in enumerate(lengths)
     ]
-    return windows_of(episodes, ["s"], ["s"], [], np.zeros(1), np.ones(1), lead=2, longest=10)
+    return windows_of(episodes, ["s"], ["s"], [], np.zeros(1), np.ones(1), lead=2, dt=0.1, longest=10)
 
 
 def test_a_long_record_is_thinned_evenly_and_windows_know_their_rows() -> None:

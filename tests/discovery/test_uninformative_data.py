@@ -249,7 +249,7 @@ def test_a_channel_without_a_window_is_refused() -> None:
     (episode, *_) = recording(swing()).train
     short = Episode(*(c if isinstance(c, str) or c is None else c[:2] for c in episode))
     with pytest.raises(DataError, match=r"none of 1 episodes \(a\) has 3 rows in a row"):
-        windows_of([short], ["s", "v"], ["s", "v"], [], np.zeros(2), np.ones(2), lead=2)
+        windows_of([short], ["s", "v"], ["s", "v"], [], np.zeros(2), np.ones(2), lead=2, dt=0.1)
 
 
 def test_json_has_null_where_a_number_does_not_exist() -> None:

@@ -13,6 +13,7 @@ from simpel_cli.data.time_gaps import _bridge
 from simpel_cli.errors import ConfigError, DataError
 
 DT_TOLERANCE = 0.02  # relative; a larger difference is another sampling time, not jitter
+FAR = 10.0  # times the simulator's dt, or less than a tenth: another unit rather than irregular rows
 MAX_UPSAMPLING = 10.0  # new rows per measured row; more are refused
 
 
@@ -36,11 +37,19 @@ def monotonic(rows: Rows, table: Table, config: Measurements) -> Check:
     return Check("time", True, "increasing")
 
 
-def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, float]:
+def sampling(
+    rows: Rows, model: Source, config: Measurements, *, as_they_are: bool = False
+) -> tuple[Check, float, float]:
     """Compare the distance of the rows with the simulator's dt.
 
+    Args:
+        rows: in the order of time within every episode.
+        model: the simulator.
+        config: `resample`.
+        as_they_are: rows at irregular times are allowed, since what comes goes from one time to the next.
+
     Returns:
-        The check, and the dt of the data, s (median).
+        The check, the dt of the data, s (median), and the longest usual step, s: a longer one may be a gap.
 
     Raises:
         ConfigError: data.resample is not the simulator's dt.
@@ -53,7 +62,7 @@ def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, fl
         )
     steps = np.diff(rows.time)[follows(rows)]
     if len(steps) == 0 and not model.states and config.resample is None:
-        return Check("sampling", True, "every row is an episode of its own"), model.dt
+        return Check("sampling", True, "every row is an episode of its own"), model.dt, model.dt
     if len(steps) == 0:
         raise DataError(f"too few rows: none of {len(rows.time)} rows follows another in the same episode.")
     dt = float(np.median(steps))
@@ -63,6 +72,13 @@ def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, fl
             f"the rows are {dt:.4g} s apart: resampling to {model.dt:g} s would interpolate most rows.{in_ms} "
             f"Record faster, or set sim.dt: {dt:.4g} and data.resample: null."
         )
+    if as_they_are and irregular_share(steps, dt) > IRREGULAR_SHARE and 1 / FAR < dt / model.dt < FAR:
+        longest = max(dt, model.dt, float(np.percentile(steps, 99)))
+        detail = (
+            f"irregular steps, median {dt:.4g} s, 1st to 99th percentile {np.percentile(steps, 1):.3g} to "
+            f"{np.percentile(steps, 99):.3g} s: every row keeps its time"
+        )
+        return Check("sampling", True, detail), dt, longest
     if config.resample is None and model.states and abs(dt / model.dt - 1) > DT_TOLERANCE:
         bridge, why = "", ""
         if irregular_share(steps, dt) > IRREGULAR_SHARE:
@@ -72,4 +88,4 @@ def sampling(rows: Rows, model: Source, config: Measurements) -> tuple[Check, fl
             f"the rows are {dt:.4g} s apart{why}, but simulator '{model.name}' has dt = {model.dt:g} s.{in_ms} "
             f"Resample the data with data.resample: {model.dt:g}{bridge}, or set sim.dt: {dt:.4g}."
         )
-    return Check("sampling", True, f"dt {dt:.4g} s"), dt
+    return Check("sampling", True, f"dt {dt:.4g} s"), dt, dt

@@ -71,13 +71,14 @@ def quantisation(signals: Mapping[str, Sequence[np.ndarray]], units: Mapping[str
     )
 
 
-def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None) -> Check:
+def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None, *, as_they_are: bool = False) -> Check:
     """Find time stamps that are not equidistant.
 
     Args:
         times: of contiguous rows, each (T,) s.
         dt: of the data, s.
         wanted: dt to resample to, s, for the advice; None: the data are resampled anyway, which removes the jitter.
+        as_they_are: every row keeps its time, so that there is nothing to do.
     """
     steps = np.concatenate([np.diff(time) for time in times]) if times else np.empty(0)
     share = irregular_share(steps, dt)
@@ -89,6 +90,8 @@ def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None) -> Chec
     )
     if share <= IRREGULAR_SHARE:
         return Check("jitter", True, detail)
+    if as_they_are:
+        return Check("jitter", True, f"{detail}; every row keeps its time")
     cure = "resampled to equal steps" if wanted is None else f"data.resample: {wanted:.6g} makes them equal"
     return Check("jitter", wanted is None, f"{detail}; {cure}")
 

@@ -1,6 +1,7 @@
 """Units of columns against units of the simulator, and angles."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -8,6 +9,7 @@ import yaml
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.recording import Check
 from simpel_cli.data.tables.table import Table
+from simpel_cli.data.timing.joined_tables import Joined
 from simpel_cli.data.unit_words import canonical
 from simpel_cli.errors import DataError
 from simulators.model import Quantity
@@ -34,7 +36,12 @@ def read_card(path: Path) -> tuple[dict[str, str], Path | None]:
 
 
 def check_units(
-    config: Measurements, table: Table, measured: dict[str, str], quantities: tuple[Quantity, ...]
+    config: Measurements,
+    table: Table,
+    measured: dict[str, str],
+    quantities: tuple[Quantity, ...],
+    joined: Sequence[Joined] = (),
+    home: Mapping[str, int] | None = None,
 ) -> tuple[Check, tuple[Path, ...]]:
     """Compare every declared unit with the simulator's; the data YAML wins over the file, the file over the card.
 
@@ -43,6 +50,8 @@ def check_units(
         table: declares units per column, as may a card beside each of its files.
         measured: quantity -> column.
         quantities: all quantities of the simulator.
+        joined: tables of other sensors.
+        home: quantity -> which of them has its column; the others are in `table`.
 
     Returns:
         The check, and the cards that were read.
@@ -52,16 +61,18 @@ def check_units(
     """
     compared: set[str] = set()
     cards: dict[Path, None] = {}
-    for sheet in table.sheets:
+    home = home or {}
+    of_main = [*([config.time] if config.time is not None else []), *config.times.values()]
+    tables = [(None, table, of_main), *((i, other.table, [other.time]) for i, other in enumerate(joined))]
+    for which, sheet, stamps in ((which, sheet, stamps) for which, t, stamps in tables for sheet in t.sheets):
         of_card, card = read_card(sheet.path)
         cards |= {card: None} if card is not None else {}
         of_column = of_card | sheet.units
-        if config.time is not None and canonical(of_column.get(config.time) or "s") != "s":
-            raise DataError(
-                f"column '{config.time}' of {sheet.path.name} is in {of_column[config.time]}, but time is read in s."
-            )
+        for time in stamps:
+            if canonical(of_column.get(time) or "s") != "s":
+                raise DataError(f"column '{time}' of {sheet.path.name} is in {of_column[time]}, but time is read in s.")
         for quantity in quantities:
-            column = measured.get(quantity.name)
+            column = measured.get(quantity.name) if home.get(quantity.name) == which else None
             unit = config.units.get(quantity.name, of_column.get(column) if column is not None else None)
             if column is None or not unit or not quantity.unit:  # one of them is not stated
                 continue

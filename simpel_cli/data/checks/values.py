@@ -31,14 +31,9 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...], *, partial:
     Raises:
         DataError: no row is left.
     """
-    last = np.append(rows.episode[1:] != rows.episode[:-1], True) & (rows.position > 0)
-    inputs, note = rows.inputs.copy(), ""
-    if measured.size and rows.next_states.shape[1] == 0:
-        ends = np.flatnonzero(last & ~np.isfinite(inputs).all(axis=1))
-        inputs[ends] = inputs[ends - 1]
-        note = f"; {len(ends)} episodes end without a command" if len(ends) else ""
-    rows = rows._replace(inputs=inputs)
-    values = np.column_stack([rows.time, rows.states[:, measured], inputs, rows.outputs, rows.next_states])
+    rows, ends = _with_last_inputs(rows)
+    note = f"; {ends} episodes end without a command" if ends else ""
+    values = np.column_stack([rows.time, rows.states[:, measured], rows.inputs, rows.outputs, rows.next_states])
     good = np.isfinite(values) & (np.abs(values) < LARGEST)
     if partial:
         return _partial(rows, measured, good, names)
@@ -56,6 +51,24 @@ def finite(rows: Rows, measured: np.ndarray, names: tuple[str, ...], *, partial:
     where = ", ".join(name for name, column in zip(names, good.T, strict=True) if not column.all()) or "the episode"
     detail = f"{dropped} of {len(keep)} rows dropped (NaN, inf or empty in {where}); episodes are cut there{note}"
     return Check("finite", False, detail), rows.take(keep)
+
+
+def usable(rows: Rows) -> np.ndarray:
+    """Mask (n,) of the rows whose time, inputs and episode are known."""
+    rows, _ = _with_last_inputs(rows)
+    known = np.column_stack([rows.time, rows.inputs])
+    return np.asarray((np.isfinite(known) & (np.abs(known) < LARGEST)).all(axis=1) & (rows.episode != ""))
+
+
+def _with_last_inputs(rows: Rows) -> tuple[Rows, int]:
+    """Hold the input in the last row of an episode that has none: no transition starts there. Return how many there are."""
+    if not rows.states.shape[1] or rows.next_states.shape[1]:
+        return rows, 0
+    last = np.append(rows.episode[1:] != rows.episode[:-1], True) & (rows.position > 0)
+    inputs = rows.inputs.copy()
+    ends = np.flatnonzero(last & ~np.isfinite(inputs).all(axis=1))
+    inputs[ends] = inputs[ends - 1]
+    return rows._replace(inputs=inputs), len(ends)
 
 
 def _partial(rows: Rows, measured: np.ndarray, good: np.ndarray, names: tuple[str, ...]) -> tuple[Check, Rows]:

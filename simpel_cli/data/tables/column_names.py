@@ -1,12 +1,13 @@
 """Names of columns in a data YAML: a column may also be called by its whole header, e.g. `phi [rad]`."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.tables.table import Table
 
 
-def with_short_names(config: Measurements, table: Table, outputs: tuple[str, ...]) -> Measurements:
+def with_short_names(config: Measurements, table: Table, outputs: tuple[str, ...] = ()) -> Measurements:
     """Return the data YAML with the name of a column wherever it gives a whole header.
 
     Args:
@@ -32,4 +33,19 @@ def with_short_names(config: Measurements, table: Table, outputs: tuple[str, ...
     if "column" in split:
         split["column"] = short(split["column"])
     columns = {quantity: short(column) for quantity, column in config.columns.items()}
-    return replace(config, time=short(config.time), episode=short(config.episode), columns=columns, split=split)
+    times = {quantity: full.get(column, column) for quantity, column in config.times.items()}
+    return replace(
+        config, time=short(config.time), episode=short(config.episode), columns=columns, times=times, split=split
+    )
+
+
+def with_names_of_joined(config: Measurements, joined: Sequence[Table], main: Table) -> Measurements:
+    """Return the data YAML with the name of a column wherever `columns` gives a whole header of a joined table.
+
+    Args:
+        config: the data YAML.
+        joined: tables of other sensors.
+        main: the table of `data.path`, whose columns precede.
+    """
+    full = {text: name for table in joined for text, name in table.full.items() if text not in main.columns}
+    return replace(config, columns={q: full.get(c, c) if c is not None else None for q, c in config.columns.items()})

@@ -16,12 +16,13 @@ from simpel_cli.errors import ConfigError, DataError, did_you_mean
 BY_FILE = "data.split.test_files"  # column that `by_file` adds to a table
 
 
-def locate(path: str, base: Path) -> list[Found]:
+def locate(path: str, base: Path, key: str = "data.path") -> list[Found]:
     """Find the file, or the files of a pattern.
 
     Args:
         path: absolute, else tried against `base`, then against the working directory.
         base: the config file's folder.
+        key: that names it, for messages.
 
     Raises:
         ConfigError: the pattern can be read in two ways.
@@ -32,12 +33,12 @@ def locate(path: str, base: Path) -> list[Found]:
         if found := _at(candidate):
             return found
     if is_pattern(path):
-        raise DataError(_no_match(path, tried))
+        raise DataError(_no_match(path, tried, key))
     folder = ""
     if any(c.is_dir() for c in tried):
         folder = f" It is a folder, not a file: for the files in it write '{path.rstrip('/')}/*.csv'."
     places = ", ".join(dict.fromkeys(str(c.resolve()) for c in tried))
-    raise DataError(f"data.path: '{path}' was not found.{folder} Tried: {places}.")
+    raise DataError(f"{key}: '{path}' was not found.{folder} Tried: {places}.")
 
 
 def absolute(data: Mapping[str, Any], base: Path) -> dict[str, Any]:
@@ -62,6 +63,11 @@ def absolute(data: Mapping[str, Any], base: Path) -> dict[str, Any]:
     done = dict(data)
     if "path" in done:
         done["path"] = all_found(done["path"])
+    if isinstance(done.get("join"), list | tuple):
+        done["join"] = [
+            dict(node) | {"path": all_found(node["path"])} if isinstance(node, Mapping) and "path" in node else node
+            for node in done["join"]
+        ]
     split = done.get("split")
     if isinstance(split, Mapping) and isinstance(split.get("test_files"), list | tuple):
         # a bare file name stands for the file of that name in data.path, which need not lie in the same folder
@@ -117,13 +123,13 @@ def _is_one(place: Path) -> bool:
     return place.is_file() or is_bag(place)
 
 
-def _no_match(path: str, tried: list[Path]) -> str:
+def _no_match(path: str, tried: list[Path], key: str) -> str:
     looked = {}
     for place in tried:
         folder, names = nearest(Path(os.path.abspath(place)))
         looked[str(folder)] = f"{folder} (nearest there: {', '.join(names) or 'it has no files'})"
     return (
-        f"data.path: no file matches '{path}'. Looked in: {'; '.join(looked.values())}. * stands for any text but a slash, ** "
+        f"{key}: no file matches '{path}'. Looked in: {'; '.join(looked.values())}. * stands for any text but a slash, ** "
         "for folders, ? for one letter, {name} for text that becomes a column."
     )
 

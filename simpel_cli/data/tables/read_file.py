@@ -16,8 +16,12 @@ from simpel_cli.errors import DataError
 Reader = Callable[[Path], Sheet]
 
 
-def read_sheet(path: Path) -> Sheet:
+def read_sheet(path: Path, key: str = "data.path") -> Sheet:
     """Read a file by its extension, or the folder of a rosbag2.
+
+    Args:
+        path: of the file.
+        key: that names it, for messages.
 
     Raises:
         DataError: it has another extension, or the file is empty, damaged, has no rows, repeats a name or is written in a way
@@ -26,7 +30,7 @@ def read_sheet(path: Path) -> Sheet:
     reader = read_rosbag if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError(
-            f"data.path: {path.name} ends in '{path.suffix}', only {', '.join(READERS)} and the folder of a rosbag2 can be "
+            f"{key}: {path.name} ends in '{path.suffix}', only {', '.join(READERS)} and the folder of a rosbag2 can be "
             "read."
         )
     if path.is_file() and path.stat().st_size == 0:

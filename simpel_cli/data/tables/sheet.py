@@ -59,6 +59,14 @@ class Sheet:
             raise self._not_a_number(name, column) from error
         return numbers.to_numpy(zero_copy_only=False).astype(np.float64)
 
+    def zero(self, name: str) -> int | None:
+        """Return what `numbers` counts a column of time stamps from, ns since 1970; None: it is a column of numbers."""
+        column = self.columns[name]
+        if not pa.types.is_timestamp(column.type):
+            return None
+        first = pc.min(pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())).as_py()
+        return 0 if first is None else int(first)
+
     def labels(self, name: str) -> np.ndarray:
         """Column as text, shape (n,); whole numbers without a decimal point, a missing entry is empty."""
         column = self.columns[name]

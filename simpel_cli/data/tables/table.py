@@ -88,6 +88,10 @@ class Table:
             return self.computed[name]
         return np.concatenate([sheet.numbers(name) for sheet in self.sheets])
 
+    def zeros(self, name: str) -> tuple[int | None, ...]:
+        """What `numbers` counts a column of time stamps from, in every file, see `Sheet.zero`."""
+        return tuple(None if name in self.computed else sheet.zero(name) for sheet in self.sheets)
+
     def labels(self, name: str) -> np.ndarray:
         """Column as text, shape (n,), see `Sheet.labels`."""
         if name in self.computed:
@@ -112,20 +116,21 @@ class Table:
         return DataError(f"column '{column}' is missing in {self.name} (it has: {has}).{hint}\n{cure}")
 
 
-def read_table(paths: tuple[Path, ...], named: Sequence[Mapping[str, str]] = ()) -> Table:
+def read_table(paths: tuple[Path, ...], named: Sequence[Mapping[str, str]] = (), key: str = "data.path") -> Table:
     """Read files.
 
     Args:
         paths: of the files.
         named: of each file, column -> text that its name gives; numbers if all files give numbers.
+        key: that names the files, for messages.
 
     Raises:
         DataError: what `read_sheet` refuses, a file that is named twice, or a column that one of the files lacks.
     """
     twice = [path.name for path, count in Counter(paths).items() if count > 1]
     if twice:
-        raise DataError(f"data.path: {twice[0]} is named twice. Name each file once.")
-    sheets = _with_names(tuple(read_sheet(path) for path in paths), named)
+        raise DataError(f"{key}: {twice[0]} is named twice. Name each file once.")
+    sheets = _with_names(tuple(read_sheet(path, key) for path in paths), named, key)
     for sheet in sheets:
         for other in sheets:
             lacking = [name for name in other.columns if name not in sheet.columns]
@@ -133,12 +138,12 @@ def read_table(paths: tuple[Path, ...], named: Sequence[Mapping[str, str]] = ())
                 raise DataError(
                     f"column '{lacking[0]}' is missing in {sheet.path.name}, but {other.path.name} has it "
                     f"({sheet.path.name} has: {', '.join(sheet.columns)}).{did_you_mean(lacking[0], list(sheet.columns))} "
-                    "The files of data.path are read as one and need the same columns: rename, add or remove it."
+                    f"The files of {key} are read as one and need the same columns: rename, add or remove it."
                 )
     return Table(sheets)
 
 
-def _with_names(sheets: tuple[Sheet, ...], named: Sequence[Mapping[str, str]]) -> tuple[Sheet, ...]:
+def _with_names(sheets: tuple[Sheet, ...], named: Sequence[Mapping[str, str]], key: str) -> tuple[Sheet, ...]:
     """Sheets with the columns that the names of their files give."""
     numeric = {
         name: all(NUMBER.fullmatch(texts[name]) for texts in named if name in texts)
@@ -150,7 +155,7 @@ def _with_names(sheets: tuple[Sheet, ...], named: Sequence[Mapping[str, str]]) -
         for name in texts:
             if name in sheet.columns:
                 raise DataError(
-                    f"data.path: {{{name}}} makes a column '{name}', but {sheet.path.name} has one already. Give it another "
+                    f"{key}: {{{name}}} makes a column '{name}', but {sheet.path.name} has one already. Give it another "
                     "name in the pattern, or write * there."
                 )
         added = {

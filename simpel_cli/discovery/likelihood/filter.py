@@ -7,6 +7,10 @@ special. The process noise q makes the horizon adapt: a wrong model follows the 
 episodes. R is diagonal, so a row of measurements is taken in one scalar after the other (Bierman 1977): no inverse, and
 a missing one is left out.
 
+Rows need not be equally far apart, nor values be measured at their row: behind the inputs stand then the step to the next
+row, in dt, and how long before its row each value was measured. A measurement of weight w has the noise R/w: one that lies far
+off costs itself little and is not thrown away.
+
 Derivatives do without second derivatives inside the integrator. Where a noise moves they are exact. Where a parameter of a
 small model moves, the Jacobian of a row follows to second order in dt. A large model holds its gains then, as the innovations
 form of a prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
@@ -28,6 +32,7 @@ from jaxtyping import Array, Float
 
 from simpel_cli.discovery.likelihood.augmented import Augmented
 from simpel_cli.discovery.likelihood.derivatives import Moving, Value, movable, still, with_slope
+from simpel_cli.discovery.likelihood.early_values import slope_back, way_back
 from simpel_cli.discovery.likelihood.sensor_delay import back, echo, no_jumps, pushed
 from simpel_cli.discovery.likelihood.small_matrices import along, apart, product
 from simpel_cli.dynamics.input_delay import delayed_inputs
@@ -61,6 +66,7 @@ class Held(NamedTuple):
     gain: Float[Array, "T ny nx ..."]  # 0 where a measurement does not count
     prompt: Float[Array, "T ny nx ..."]  # slope of what the sensors would read, were none late
     rate_x: Float[Array, "T nx nx ..."]  # slope of the rates in the state, at the end of the row before
+    pace: Float[Array, "T ..."] | None  # step to the next row, in dt; None: all are dt
 
 
 class Filter(NamedTuple):
@@ -73,8 +79,10 @@ class Filter(NamedTuple):
         louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
+        read: (p, x of the row before, its u of the substeps, x, u of the substeps) -> what is read in a row, of which each
+            value may have been measured before it.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
-            and end.
+            and end; what stands behind the inputs, behind them.
     """
 
     track: Callable[..., tuple[Track, Held]]
@@ -82,6 +90,7 @@ class Filter(NamedTuple):
     louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
+    read: Callable[..., Float[Array, " ny"]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
 
 
@@ -116,12 +125,11 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
 
 def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     model = augmented.model
-    rates, sensors = with_slope(augmented, 0), with_slope(augmented, 1)
-    moving_rates, moving_sensors = movable(augmented, 0), movable(augmented, 1)
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
+    rates, sensors = (_of_inputs(with_slope(augmented, i), nu) for i in (0, 1))
+    moving_rates, moving_sensors = (_of_inputs(movable(augmented, i), nu) for i in (0, 1))
     small = nx <= SMALL  # of a large one the second derivatives are not even made
-    bend = movable(augmented, 0, slope=True) if small else None
-    h = dt / substeps
+    bend = _of_inputs(movable(augmented, 0, slope=True), nu) if small else None
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
@@ -136,7 +144,19 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             values[signal] = values[signal] + p[row]
         return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
 
+    def pace_of(u: Array) -> Array | None:
+        """Return the step to the next row, in dt; u: of a row, (nu, ...) or more; None: it is dt."""
+        return u[nu] if u.shape[0] > nu else None
+
     def inputs(p: Array, u: Array) -> Array:
+        """Return the inputs of every substep, and behind them what stands behind the inputs of a row."""
+        arriving = late_inputs(p, u[:, :nu])
+        if u.shape[1] == nu:
+            return arriving
+        clock = u[lead:, None, None, nu:]
+        return jnp.concatenate([arriving, jnp.broadcast_to(clock, (*arriving.shape[:3], *clock.shape[3:]))], axis=3)
+
+    def late_inputs(p: Array, u: Array) -> Array:
         times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
         more = {"half_play": per_signal(p, plays, nu)} if plays else {}
         if linear:
@@ -151,6 +171,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
     stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
 
+    def length(u: Array) -> Array | float:
+        """Return the length of a substep, s."""
+        pace = pace_of(u)
+        return dt / substeps if pace is None else dt / substeps * pace
+
     def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
         """Return the state one row later, and the rate there."""
 
@@ -159,6 +184,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
             def stage(carry: tuple[Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
                 (total, slope), (weights, u) = carry, now
+                h = length(u)
                 slope = moving_rates(x + h * weights[0] * slope, u, given)
                 return (total + h * weights[1] * slope, slope), None
 
@@ -171,6 +197,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, None]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
+            h = length(u)
             slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
             slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
             after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
@@ -188,18 +215,35 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     late_ones = bool(sensor_delays or sensor_lags)
 
+    def early_of(u: Array) -> Array | None:
+        """Return how long before its row each value was measured, (ny, ...); u: of a row, (nu, ...) or more; None: at it."""
+        return u[nu + 1 :] if u.shape[0] > nu else None
+
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny), per_signal(p, sensor_lags, ny)
 
-    def seen(p: Array, x: Array, u: Array, rate: Array, rate_x: Array, jumps: Array) -> tuple[Array, Array, Array]:
+    def seen(
+        p: Array,
+        x: Array,
+        u: Array,
+        rate: Array,
+        rate_x: Array,
+        jumps: Array,
+        early: Array | None,
+        begin: tuple[Array, ...],
+    ) -> tuple[Array, Array, Array]:
         """Return what the sensors read, its derivative in the state, and the latter if no sensor were late."""
         y, prompt = sensors(x, u, p)
-        if not late_ones:
-            return y, prompt, prompt
-        d, tau = late_by(p)
-        read = y + jnp.sum(prompt * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
-        return read, prompt - (d + tau)[:, None] * product(prompt, rate_x), prompt
+        read, slope = y, prompt
+        if early is not None:
+            read = read + jnp.sum(prompt * way_back(early, x, rate, begin), axis=1)
+            slope = slope_back(early, prompt, rate_x)
+        if late_ones:
+            d, tau = late_by(p)
+            read = read + jnp.sum(prompt * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
+            slope = slope - (d + tau)[:, None] * product(prompt, rate_x)
+        return read, slope, prompt
 
     def wrapped(error: Array) -> Array:
         """Take a difference of angles the short way round; error: (ny, ...)."""
@@ -211,6 +255,16 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Half of the process noise of a row: it enters before and after the flow."""
         return along(jnp.eye(nx), noise.q.ndim - 1) * (noise.q**2 * (dt / 2))[None]
 
+    def of_row(half: Array, pace: Array | None) -> Array:
+        return half if pace is None else half * pace[None, None]
+
+    def counts(weight: Array) -> Array:
+        return jnp.where(weight > 0, 1.0, 0.0)
+
+    def loud(r: Array, weight: Array) -> Array:
+        """Return the variance of a measurement of so much weight; 0: it does not count."""
+        return r**2 / jnp.where(weight > 0, weight, 1.0)
+
     def after(cov: Array, jacobian: Array, half: Array) -> Array:
         return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
 
@@ -220,12 +274,12 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
         u_sub, half = inputs(p, u), halved(noise)
 
-        def row(carry: tuple[Array, ...], data: tuple[Array, Array, Array]) -> tuple[tuple, tuple[Track, Held]]:
-            x, cov, u_before, rate, rate_x, jumps = carry
+        def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
+            x, cov, u_before, rate, rate_x, jumps, begin = carry
             y_k, ok_k, u_k = data
-            predicted, predicted_cov = x, cov
+            predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0])
             # the sensor is read at the row: what arrived up to it is the last substep before
-            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps)
+            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps, early_of(u_k[0, 0]), begin)
             if late_ones:
                 jumps = pushed(jumps, prompt, rate, rates(x, u_k[0, 0], p)[0])
             off = wrapped(y_k - h_k)
@@ -233,9 +287,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             for j in range(ny):
                 c = slope[j]
                 reach = apart(product(cov, c[:, None])[:, 0])
-                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
                 e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
-                gain = apart((ok_k[j] / s)[None] * reach)
+                gain = apart((counts(ok_k[j]) / s)[None] * reach)
                 errors.append(e)
                 variances.append(s)
                 gains.append(gain)
@@ -245,18 +299,32 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             following, jacobian, rate_after, rate_x_after = flow_with_slope(p, x, u_k)
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
-            held = Held(jnp.stack(gains), prompt, rate_x)
-            carry = following, after(cov, jacobian, half), u_k[-1, -1], rate_after, rate_x_after, jumps
+            held = Held(jnp.stack(gains), prompt, rate_x, pace)
+            begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
+            carry = (
+                following,
+                after(cov, jacobian, of_row(half, pace)),
+                u_k[-1, -1],
+                rate_after,
+                rate_x_after,
+                jumps,
+                begin,
+            )
             return carry, (out, held)
 
         first = u_sub[0, 0, 0]
-        begin = (start, of_start(spread), first, *rates(start, first, p), no_jumps(ny, start))
+        rate, rate_x = rates(start, first, p)
+        begin = (start, of_start(spread), first, rate, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
         return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
+
+    def at_rest(u: Array, x: Array, rate: Array) -> tuple[Array, ...]:
+        """Return what came before the first row: the same rate."""
+        return () if pace_of(u) is None else (x - dt * rate, rate, jnp.full(x.shape[1:], dt, x.dtype))
 
     def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
         """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
         slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0, 0], u[-1, -1]), strict=True)), jnp.zeros(()))
-        change = dt / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
+        change = substeps * length(u[0, 0]) / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
         return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
 
     def moved(
@@ -264,22 +332,29 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     ) -> tuple[Array, Array]:
         u_sub, half = inputs(given.p, u), halved(noise)
 
-        def row(carry: tuple[Array, ...], data: tuple[Any, ...]) -> tuple[tuple, tuple[Array, Array]]:
-            x, cov, u_before, rate, jumps = carry
+        def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
+            x, cov, u_before, rate, jumps, begin = carry
             y_k, ok_k, u_k, at_k, held_k = data
-            read, predicted = moving_sensors(x, u_before, given), x
+            read, predicted, pace = moving_sensors(x, u_before, given), x, pace_of(u_k[0, 0])
+            if (early := early_of(u_k[0, 0])) is not None:
+                read = read + jnp.sum(held_k.prompt * way_back(early, x, rate, begin), axis=1)
             if late_ones:
                 late = late_by(given.p)
                 read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
                 jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0, 0], given))
+            slope = at_k.slope
+            if early is not None and bend is not None:
+                rate_x = bend(x, u_before, given).reshape(nx, nx, *x.shape[1:])
+                turned = slope_back(early, held_k.prompt, rate_x)
+                slope = slope + turned - jax.lax.stop_gradient(turned)
             off = wrapped(y_k - read)
             errors, variances = [], []
             for j in range(ny):
-                c, gain, s = at_k.slope[j], held_k.gain[j], at_k.variance[j]
+                c, gain, s = slope[j], held_k.gain[j], at_k.variance[j]
                 if small:
                     reach = product(cov, c[:, None])[:, 0]
-                    s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
-                    gain = (ok_k[j] / s)[None] * reach
+                    s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
+                    gain = (counts(ok_k[j]) / s)[None] * reach
                     cov = cov - gain[:, None] * reach[None]
                 e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
                 errors.append(e)
@@ -287,34 +362,36 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 x = x + gain * e[None]
             following, rate = flow(given, x, u_k)
             if bend is not None:
-                cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), half)
-            return (following, cov, u_k[-1, -1], rate, jumps), (jnp.stack(errors), jnp.stack(variances))
+                cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), of_row(half, pace))
+            begin = () if pace is None else (x, moving_rates(x, u_k[0, 0], given), dt * pace)
+            return (following, cov, u_k[-1, -1], rate, jumps, begin), (jnp.stack(errors), jnp.stack(variances))
 
         first = u_sub[0, 0, 0]
-        begin = (start, of_start(spread), first, moving_rates(start, first, given), no_jumps(ny, start))
+        rate = moving_rates(start, first, given)
+        begin = (start, of_start(spread), first, rate, no_jumps(ny, start), at_rest(first, start, rate))
         return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
 
     def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
         half = halved(noise)
 
-        def row(carry: tuple[Array, Array], data: tuple[Array, ...]) -> tuple[tuple, tuple[Array, Array]]:
+        def row(carry: tuple[Array, Array], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
             away, cov = carry  # away: from the state of `at`
-            e_k, gain, slope, jacobian, ok_k = data
+            e_k, gain, slope, jacobian, ok_k, pace = data
             errors, variances = [], []
             for j in range(ny):
                 c = slope[j]
                 reach = product(cov, c[:, None])[:, 0]
-                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2
+                s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
                 e = e_k[j] - product(c[None], away[:, None])[0, 0]
-                own = (ok_k[j] / s)[None] * reach
+                own = (counts(ok_k[j]) / s)[None] * reach
                 errors.append(e)
                 variances.append(s)
                 away = away + own * e[None] - gain[j] * e_k[j][None]
                 cov = cov - own[:, None] * reach[None]
             away = product(jacobian, away[:, None])[:, 0]
-            return (away, after(cov, jacobian, half)), (jnp.stack(errors), jnp.stack(variances))
+            return (away, after(cov, jacobian, of_row(half, pace))), (jnp.stack(errors), jnp.stack(variances))
 
-        data = (at.innovation, held.gain, at.slope, at.jacobian, ok)
+        data = (at.innovation, held.gain, at.slope, at.jacobian, ok, held.pace)
         return jax.lax.scan(row, (jnp.zeros_like(spread), of_start(spread)), data)[1]
 
     def plain_flow(p: Array, x: Array, u: Array) -> Array:
@@ -323,7 +400,21 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
         return sensors(x, u, p)[0]
 
-    return Filter(track, moved, louder, plain_flow, plain_measure, inputs)
+    def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array) -> Array:
+        end = u_before[-1, -1]
+        now, slope = sensors(x, end, p)
+        pace, early = pace_of(end), early_of(u[0, 0])
+        if pace is None or early is None:
+            return now
+        begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
+        return now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
+
+    return Filter(track, moved, louder, plain_flow, plain_measure, read, inputs)
+
+
+def _of_inputs(function: Any, nu: int) -> Any:
+    """Take what stands behind the inputs away from a function of (x, u, ...)."""
+    return lambda x, u, *given: function(x, u[:nu], *given)
 
 
 def _over_points(function: Callable[..., Array], extra: int) -> Callable[..., Array]:

@@ -110,9 +110,11 @@ class Forces:
     def __call__(self, z: np.ndarray, track: Track, windows: Windows) -> Force:
         """Return the latent force of the model at unit coordinates z, from its filter's track."""
         smoothed = smooth(track)
-        force = (smoothed.mean[:, 1:] - self.following(z, smoothed.mean, windows)[:, :-1]) / self.dt
+        pace = windows.clock[:, :-1, :1]
+        step = self.dt * pace if pace.shape[2] else self.dt
+        force = (smoothed.mean[:, 1:] - self.following(z, smoothed.mean, windows)[:, :-1]) / step
         variance = np.maximum(np.diagonal(smoothed.moved_cov, axis1=-2, axis2=-1), 0.0)
-        return Force(smoothed.mean, force, np.sqrt(variance) / self.dt)
+        return Force(smoothed.mean, force, np.sqrt(variance) / step)
 
     def inputs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
         """Return the inputs as they arrive, (W, T, nu), the mean of every row."""
@@ -122,7 +124,7 @@ class Forces:
     def following(self, z: np.ndarray, state: np.ndarray, windows: Windows) -> np.ndarray:
         """Return where the model takes every state, (W, T, nx), in one row."""
         p, _ = self.coordinates.physical(jnp.asarray(z))
-        u = np.asarray(self._arriving(p, jnp.asarray(windows.u)))
+        u = np.asarray(self._arriving(p, windows.arrays[2]))
         rows_in_all = state.shape[0] * state.shape[1]
         x, u = state.reshape(rows_in_all, -1), u.reshape(rows_in_all, *u.shape[2:])
         parts = []

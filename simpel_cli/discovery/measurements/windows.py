@@ -13,6 +13,8 @@ from simpel_cli.errors import DataError
 LEAST = 3  # rows of a window: a start, and one that it predicts, and one that confirms it
 LONGEST = 256  # rows of a window: a longer record is cut, and its windows run side by side
 LEAST_EPISODES = 3  # to hold out whole ones
+UNEVEN = 0.01  # of a step: a clock that strays less is taken for even
+ROUNDED = 3  # different steps of an even clock with rounded stamps; one more than two, since floating point rounds, too
 LONGEST_TEST = 2048  # of a window on which free runs are judged
 
 
@@ -21,12 +23,14 @@ class Windows(NamedTuple):
 
     Args:
         y: (W, T, ny) measurements, 0 where they do not count.
-        ok: (W, T, ny) 1 where a measurement counts, else 0.
+        ok: (W, T, ny) how much a measurement counts, up to 1; 0: not at all. Its noise has the variance R/ok.
         u: (W, lead + T, nu) inputs, with `lead` rows of the past in front.
         start: (W, nx) guess of the first state.
         spread: (W, nx) standard deviation of the first state about it.
         episode: (W,) index of the episode, in the order given.
         begin: (W,) row of the episode at which the window begins.
+        clock: (W, T, 1 + ny) step to the next row, in dt, and how long before its row each value was measured, s; (W, T, 0)
+            where rows are dt apart and all values are measured at them.
     """
 
     y: np.ndarray
@@ -36,11 +40,15 @@ class Windows(NamedTuple):
     spread: np.ndarray
     episode: np.ndarray
     begin: np.ndarray
+    clock: np.ndarray
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """What the filter takes, window by window."""
-        return tuple(jnp.asarray(a) for a in (self.y, self.ok, self.u, self.start, self.spread))
+        """What the filter takes, window by window: the clock stands behind the inputs."""
+        lead = self.u.shape[1] - self.clock.shape[1]
+        clock = np.pad(self.clock, ((0, 0), (lead, 0), (0, 0)))
+        u = np.concatenate([self.u, clock], axis=2)
+        return tuple(jnp.asarray(a) for a in (self.y, self.ok, u, self.start, self.spread))
 
 
 def thinned(windows: Windows, rows: int) -> tuple[Windows, Windows | None]:
@@ -71,6 +79,8 @@ def windows_of(
     spread: np.ndarray,
     *,
     lead: int,
+    dt: float,
+    clocked: bool = False,
     at_least: int = 1,
     longest: int = LONGEST,
 ) -> Windows:
@@ -84,6 +94,8 @@ def windows_of(
         centre: (nx,) guess of a state that no channel measures.
         spread: (nx,) standard deviation of a first state about its guess.
         lead: rows of past input that delays and lags look back on; before the record the first input is assumed.
+        dt: of the model, s.
+        clocked: rows follow their time stamps, and values their own (see `clocked`); else rows are dt apart.
         at_least: windows per episode, so that few episodes can be held out in parts.
         longest: rows of a window.
     """
@@ -98,6 +110,7 @@ def windows_of(
         "spread": [],
         "episode": [],
         "begin": [],
+        "clock": [],
     }
     for index, episode in enumerate(episodes):
         columns = [
@@ -106,6 +119,7 @@ def windows_of(
         ]
         y = np.stack(columns, axis=1)
         past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
+        clock = _clock(episode, states, measured, outputs, dt) if clocked else np.zeros((len(y), 0))
         for begin in range(0, len(y), length):
             part = y[begin : begin + length]
             if len(part) < LEAST:
@@ -124,6 +138,7 @@ def windows_of(
             rows["spread"].append(spread)
             rows["episode"].append(np.array(index))
             rows["begin"].append(np.array(begin))
+            rows["clock"].append(np.pad(clock[begin : begin + length], ((0, missing), (0, 0)), mode="edge"))
     if not rows["y"]:
         raise DataError(
             f"data: none of {len(episodes)} episodes ({', '.join(e.name for e in episodes[:3])}"
@@ -131,6 +146,28 @@ def windows_of(
             "longer episodes, or choose others to test on (data.split)."
         )
     return Windows(*(np.stack(rows[name]) for name in Windows._fields))
+
+
+def clocked(episodes: Sequence[Episode], dt: float) -> bool:
+    """Whether rows are not dt apart or values not measured at their rows. Stamps of an even clock may be rounded."""
+    if any(e.late is not None and np.any(e.late > 0) for e in episodes):
+        return True
+    steps = np.concatenate([np.diff(e.time) for e in episodes])
+    if not np.isfinite(steps).all() or len(steps) == 0 or np.std(steps) <= UNEVEN * dt:
+        return False
+    # an even clock whose stamps are rounded knows two steps, one tick apart, about its own
+    return len(np.unique(np.round(steps / (1e-6 * dt)))) > ROUNDED
+
+
+def _clock(
+    episode: Episode, states: Sequence[str], measured: Sequence[str], outputs: Sequence[str], dt: float
+) -> np.ndarray:
+    """Return the step from every row to the next, in dt, and how long before the row each value was measured, (T, 1 + ny)."""
+    pace = np.append(np.diff(episode.time) / dt, 1.0)[:, None]
+    if episode.late is None:
+        return np.concatenate([pace, np.zeros((len(pace), len(measured)))], axis=1)
+    columns = [*states, *outputs]
+    return np.concatenate([pace, episode.late[:, [columns.index(name) for name in measured]]], axis=1)
 
 
 class Piece(NamedTuple):

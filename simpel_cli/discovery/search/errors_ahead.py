@@ -137,22 +137,30 @@ def _window(
     u_sub = rule.delayed_inputs(p, u)
     rows = y.shape[0]
 
-    def step(x: Array, k: Array) -> tuple[Array, None]:
-        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)]), None
+    def following(x: Array, k: Array) -> Array:
+        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)])
+
+    def read(before: Array, x: Array, k: Array) -> Array:
+        """Return what is read in row k, whose state is x."""
+        last, now = jnp.minimum(k - 1, rows - 1), jnp.minimum(k, rows - 1)
+        return rule.read(p, before, u_sub[last], x, u_sub[now])
+
+    def step(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], None]:
+        _, x = carry
+        return (x, following(x, k)), None
 
     def from_row(x: Array, k: Array) -> Array:
-        end = jax.lax.scan(step, x, k + jnp.arange(horizon))[0]
-        last = jnp.minimum(k + horizon - 1, rows - 1)
-        return rule.measure(p, end, u_sub[last, -1, -1])
+        before, end = jax.lax.scan(step, (x, x), k + jnp.arange(horizon))[0]
+        return read(before, end, k + horizon)
 
     reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
     ahead = jnp.concatenate([y[:horizon], reached])[:rows]
 
-    def run(x: Array, k: Array) -> tuple[Array, Array]:
+    def run(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], Array]:
+        before, x = carry
         # up to SETTLE the filter's state, from there on the model alone
         x = jnp.where(k <= SETTLE, track.mean[k], x)
-        read = rule.measure(p, x, u_sub[jnp.maximum(k - 1, 0), -1, -1])
-        return rule.flow(p, x, u_sub[k]), read
+        return (x, following(x, k)), read(before, x, jnp.maximum(k, 1))
 
-    free = jax.lax.scan(run, start, jnp.arange(rows))[1]
+    free = jax.lax.scan(run, (start, start), jnp.arange(rows))[1]
     return track, ahead, free

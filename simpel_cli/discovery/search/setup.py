@@ -11,7 +11,7 @@ from simpel_cli.discovery.likelihood.coordinates import Coordinates, coordinates
 from simpel_cli.discovery.likelihood.filter import Filter, filter_of
 from simpel_cli.discovery.measurements import windows as windows_
 from simpel_cli.discovery.measurements.integration_steps import substeps_needed
-from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, thinned, windows_of
+from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
 from simpel_cli.errors import ConfigError, DataError
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, EffectParameter
@@ -38,6 +38,7 @@ class Setup(NamedTuple):
     start: np.ndarray  # (n,) unit coordinates with every effect switched off
     lead: int
     substeps: int
+    clocked: bool  # rows follow their time stamps; else they are dt apart
 
 
 def setup(
@@ -91,9 +92,10 @@ def setup(
     if any(t.kind == BACKLASH for t in every):
         lead = max(lead, PLAY_ROWS)
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
+    timed = clocked([*recording.train, *recording.test], model.dt)
     windows = windows_of(
         recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
-        at_least=4 if len(recording.train) < 4 else 1,
+        dt=model.dt, clocked=timed, at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
     windows, spare = thinned(windows, most_rows) if most_rows is not None else (windows, None)
     if spare is not None and most_rows is not None:
@@ -122,7 +124,7 @@ def setup(
     start[effect_rows] = (augmented.neutral[effect_rows] - coordinates.low[effect_rows]) / np.where(span > 0, span, 1.0)
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
-    return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps)
+    return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps, timed)
 
 
 def measured_of(model: Model, recording: Recording) -> tuple[str, ...]:
@@ -220,6 +222,6 @@ def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str
     model = plan.augmented.model
     return windows_of(
         episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
-        lead=plan.lead,
+        lead=plan.lead, dt=model.dt, clocked=plan.clocked,
         longest=windows_.LONGEST_TEST,
     )  # fmt: skip
