@@ -113,7 +113,7 @@ class Model:
         covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
         per: uncertain parameter -> column of the groups from one to another of which it differs (`simulators.groups`).
         spreads: such a parameter -> range of its spread, where one was given.
-        asked: further columns of groups -> the key that names them: of an effect, or of what is asked about.
+        asked: further columns of groups -> the key of an effect that names them.
         groups: column -> names of the groups, where they are known: then inputs and parameters of groups are there.
         base: the model without them; None: this is it.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.

@@ -38,7 +38,7 @@ class Declared(NamedTuple):
         """The simulator, a symbolic model or a world with query access only.
 
         Data may say what inputs do between rows, and how late its outputs are recorded, in place of what it says itself;
-        effects and `discovery` say which columns name groups.
+        effects say which columns name groups.
         """
         found, data = self.groups["sim"], self.groups.get("data")
         said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
@@ -57,10 +57,8 @@ class Declared(NamedTuple):
 
     @property
     def _columns_of_groups(self) -> dict[str, str]:
-        """Columns of groups that effects or `discovery` name, each with the key that does."""
-        effects = {e.per: f"effect.{e.name}.per" for e in self.groups.get("effect") or () if e.per}
-        options = self.groups.get("discovery")
-        return dict.fromkeys(options.groups if options else (), "discovery.groups") | effects
+        """Columns of groups that effects name, each with the key that does."""
+        return {e.per: f"effect.{e.name}.per" for e in self.groups.get("effect") or () if e.per}
 
     @property
     def measurements(self) -> Measurements:

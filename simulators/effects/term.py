@@ -7,7 +7,6 @@ from simulators.groups import Grouping
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
-GROUPS = "groups"  # a parameter, of the model or of another term, that may differ from group to group
 BETWEEN_ROWS = "between_rows"  # a share of the way from an input that is held to one that is linear
 ON_INPUT = (DELAY, LAG, BACKLASH, BETWEEN_ROWS)
 ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
@@ -49,7 +48,7 @@ class Term(NamedTuple):
         depends_on: arguments of a function without a physical name; empty for named effects.
         constants: numbers of the expression that were read off the measurements, by name; programs take them as
             arguments, so that other measurements share what was compiled.
-        groupings: how its parameters differ from group to group; of a term of kind GROUPS that of another's parameter.
+        groupings: how its parameters differ from group to group.
         several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate.
     """
 

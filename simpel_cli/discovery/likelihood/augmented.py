@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from simulators.effects import Structure, Term, structure
-from simulators.effects.term import DELAY, GROUPS, INPUT, LAG, ON_INPUT, OPERATORS, SENSOR
+from simulators.effects.term import DELAY, INPUT, LAG, ON_INPUT, OPERATORS, SENSOR
 from simulators.expression import parse
 from simulators.model import Model, Quantity
 
@@ -81,8 +81,6 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
     for grouping in (g for term in terms for g in term.groupings):
         names[grouping.parameter] = grouping.value(names)
     own = p[: len(model.params)]
-    if any(t.kind == GROUPS for t in terms):
-        own = casadi.vertcat(*(names[q.name] for q in model.params))
     given = [u[j] for j in range(len(model.inputs))]
     for j, q in enumerate(model.inputs):
         for term in terms:

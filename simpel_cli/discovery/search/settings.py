@@ -20,8 +20,6 @@ class Discovery:
         rows: training rows that a search looks at, evenly spaced windows of a longer record; errors are of all test rows.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
             Without it, they are looked for in what is left at the end.
-        groups: columns that name groups, such as [ball]: which parameters differ from one to another is asked by the evidence.
-            Columns that a `per` names are asked about in any case.
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
     """
 
@@ -32,18 +30,12 @@ class Discovery:
     rows: int = 3000
     pairs: bool = False
     beginnings: int = BEGINNINGS
-    groups: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pairs and self.room < PAIR:
             raise ConfigError(
                 f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
             )
-        for name in self.groups:
-            if not isinstance(name, str) or not name.isidentifier():
-                raise ConfigError(
-                    f"discovery.groups: {name!r} is not the name of a column (letters, digits, underscores); write [ball]."
-                )
         check_at_least_one("discovery", self, ("horizon", "lanes", "room", "rows"))
         if self.beginnings < 0:
             raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")

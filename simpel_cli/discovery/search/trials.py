@@ -14,7 +14,7 @@ from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
-from simulators.effects.term import BETWEEN_ROWS, GROUPS
+from simulators.effects.term import BETWEEN_ROWS
 from simulators.groups import slot_names, spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
@@ -76,8 +76,8 @@ class Search:
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
-        # terms that are no candidates: what an input does between rows, and which parameters differ, is asked separately
-        self.banned = {t for t, term in enumerate(self.terms) if term.kind in (BETWEEN_ROWS, GROUPS)}
+        # terms that are no candidates: what an input does between rows is asked separately
+        self.banned = {t for t, term in enumerate(self.terms) if term.kind == BETWEEN_ROWS}
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
