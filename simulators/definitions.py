@@ -21,7 +21,7 @@ from simulators.quantity import (
 )
 
 INTERMEDIATE = ("unit", "expression")
-KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior", "per")  # of a parameter
+KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior", "per", "spread")  # of a parameter
 COVARIATE = ("unit", "range", "column")  # of one that is known in every row
 
 
@@ -121,17 +121,27 @@ def read_parameters(
     return tuple(uncertain), fixed, derived
 
 
-def read_groupings(nodes: Mapping[str, Any]) -> dict[str, str]:
-    """Read which uncertain parameters differ from group to group, and the columns that name the groups."""
-    found = {}
+def read_groupings(nodes: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, tuple[float, float]]]:
+    """Read which uncertain parameters differ from group to group: the columns of the groups, and ranges of spreads."""
+    found, spreads = {}, {}
     for name, node in nodes.items():
+        if isinstance(node, Mapping) and "spread" in node:
+            path = f"sim.parameters.{name}.spread"
+            if "per" not in node:
+                raise ModelError(
+                    f"{path}: only of a parameter that differs between groups; add `per: COLUMN`, or leave it out"
+                )
+            low, high = read_range(path, {"range": node["spread"]})
+            if low < 0:
+                raise ModelError(f"{path}: low = {low:g} is negative, and a standard deviation is not; give 0 or more")
+            spreads[name] = (low, high)
         if isinstance(node, Mapping) and "per" in node:
             if not isinstance(node["per"], str) or not node["per"].isidentifier():
                 raise ModelError(
                     f"sim.parameters.{name}.per: {node['per']!r} is not the name of a column (letters, digits, underscores)"
                 )
             found[name] = node["per"]
-    return found
+    return found, spreads
 
 
 def read_covariates(nodes: Mapping[str, Any]) -> tuple[tuple[Quantity, ...], dict[str, str]]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
-from simulators.definitions import UNCERTAIN
+from simulators.definitions import UNCERTAIN, read_groupings
 from simulators.expression import Symbol
 from simulators.model import Model, ModelError, column
 from simulators.quantity import (
@@ -45,7 +45,7 @@ class Extended:
     Args:
         name: letters, digits and single underscores.
         base: node of the simulator that the terms are added to.
-        parameters: name: {unit, range, prior} or a number.
+        parameters: name: {unit, range, prior, per, spread} or a number, as those of `Declared`.
         inputs: input: {value: expression in its place, delay, lag, between_rows}, each if there is one; see `Declared`.
         dynamics: state: expression that is added to its rate, in states, inputs, parameters, and rate_STATE for the rate that
             the simulator itself has.
@@ -117,6 +117,7 @@ class Extended:
             added = {name: read_term(f"sim.dynamics.{name}", text, scope) for name, text in self.dynamics.items()}
             return column(base.symbol, [rates[i] + added.get(q.name, 0) for i, q in enumerate(base.states)])
 
+        per, spreads = read_groupings(self.parameters)
         late = {key: getattr(base, key) | read_times(key, self.inputs, params, base.fixed | fixed) for key in TIMES}
         model = replace(
             base,
@@ -125,6 +126,8 @@ class Extended:
             rhs=rhs,
             output=lambda x, u, p: base.output(x, given(known(x, u, p)), p[: len(base.params)]),
             fixed=base.fixed | fixed,
+            per=base.per | per,
+            spreads=base.spreads | spreads,
             coordinates=None if self.dynamics or values else base.coordinates,
             between_rows=base.between_rows | read_between_rows(self.inputs),
             **late,

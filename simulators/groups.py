@@ -1,18 +1,19 @@
 """A parameter that differs from group to group, such as the drag of each ball: values about a common one, a learned spread.
 
-    c_g = c + s delta_g,    or, where c is positive throughout its range,    c_g = c exp(s delta_g),    delta_g ~ N(0, 1)
+    c_g = c + s delta_g,    or, where the range of c has one sign,    c_g = c exp(s delta_g),    delta_g ~ N(0, 1)
 
 c and the spread s are parameters of the population, delta_g of a group. Which group a row is of, is an input per group that is
 1 there and 0 elsewhere. The last of them is of a group that was never seen: no data tell of its delta, so that what is
-predicted for it is the population, with its spread.
+predicted for it is the population, with its spread. Parameters of a simulator and of an effect differ in the same way.
 
 Reference: Gelman and Hill (2007), Data analysis using regression and multilevel/hierarchical models, ch. 12 (partial pooling).
 """
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import casadi
 
@@ -23,6 +24,62 @@ from simulators.quantity import Quantity
 UNSEEN = "another"  # the group of rows whose group was not trained on
 DELTA = (-2.0, 2.0)  # +-2 standard deviations
 SPREAD, MEMBER = "spread", "member"  # roles of parameters: of the population, of one group
+OF_ZERO = (
+    1.5  # largest spread, of the logarithm, of a range that begins at 0: a factor of 20 at two standard deviations
+)
+
+
+class Grouping(NamedTuple):
+    """How one parameter differs from group to group.
+
+    Args:
+        parameter: its name.
+        by: column that names the groups.
+        ratio: whether a group has a factor, else something that is added.
+        spread: s, a parameter of the population.
+        members: delta of every group; the last is of one that was never seen.
+        slots: inputs that say which group a row is of, in the same order.
+        names: of the groups, as the column has them, without that one.
+    """
+
+    parameter: str
+    by: str
+    ratio: bool
+    spread: Quantity
+    members: tuple[Quantity, ...]
+    slots: tuple[str, ...]
+    names: tuple[str, ...]
+
+    @property
+    def own(self) -> tuple[Quantity, ...]:
+        """The parameters that the groups need beside the common one: the spread first."""
+        return (self.spread, *self.members)
+
+    def value(self, known: Mapping[str, Symbol]) -> Symbol:
+        """Return the parameter of the group that a row is of, from what all names stand for."""
+        off = known[self.spread.name] * casadi.sum1(
+            casadi.vertcat(*(known[slot] * known[q.name] for slot, q in zip(self.slots, self.members, strict=True)))
+        )
+        common = known[self.parameter]
+        return common * casadi.exp(off) if self.ratio else common + off
+
+
+def grouping(q: Quantity, by: str, names: tuple[str, ...], spread: tuple[float, float] | None = None) -> Grouping:
+    """Return how a parameter differs between groups.
+
+    Args:
+        q: the parameter.
+        by: column of the groups.
+        names: of the groups.
+        spread: range of the spread; None: from 0 to half of the range of the parameter.
+    """
+    ratio = q.low >= 0 or q.high <= 0
+    low, high = spread or (0.0, _most(q, ratio=ratio))
+    members = tuple(
+        Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER) for word in words((*names, UNSEEN))
+    )
+    own = Quantity(f"{q.name}_spread", "1" if ratio else q.unit, low, high, role=SPREAD)
+    return Grouping(q.name, by, ratio, own, members, slot_names(by, names), names)
 
 
 def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
@@ -30,7 +87,7 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
 
     Args:
         model: with `per`: parameter -> column of the groups.
-        groups: column -> names of its groups.
+        groups: column -> names of its groups; of columns that no parameter names there are the inputs alone.
 
     Raises:
         ModelError: a parameter that cannot differ, or a name that is taken.
@@ -38,31 +95,17 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
     """
     if not groups:
         return model
-    for key, times in (("delay", model.delay), ("lag", model.lag)):
-        for name, value in times.items():
-            if value in model.per:
-                raise ModelError(
-                    f"sim.parameters.{value}.per: sim.inputs.{name}.{key} depends on it, and a {key} is the same for all "
-                    "groups; leave `per` out"
-                )
-    slots = {by: [f"{by}_is_{word}" for word in words((*names, UNSEEN))] for by, names in groups.items()}
-    inputs = [Quantity(name, "1", 0.0, 1.0) for names in slots.values() for name in names]
+    for name in model.per:
+        refuse_late(model, name, f"sim.parameters.{name}.per")
+    slots = [name for by, names in groups.items() for name in slot_names(by, names)]
+    inputs = [Quantity(name, "1", 0.0, 1.0) for name in slots]
     taken = {q.name for q in (*model.states, *model.inputs, *model.params, *model.outputs)} | model.fixed.keys()
-    own: list[Quantity] = []
-    places: dict[int, tuple[bool, int, list[tuple[int, int]]]] = {}
-    first = {name: len(model.inputs) + i for i, name in enumerate(q.name for q in inputs)}
-    for i, q in enumerate(model.params):
-        if q.name not in model.per:
-            continue
-        by = model.per[q.name]
-        ratio = q.low > 0
-        at = len(model.params) + len(own)
-        own.append(Quantity(f"{q.name}_spread", "1" if ratio else q.unit, 0.0, _most(q, ratio=ratio), role=SPREAD))
-        pairs = []
-        for slot, word in zip(slots[by], words((*groups[by], UNSEEN)), strict=True):
-            pairs.append((first[slot], len(model.params) + len(own)))
-            own.append(Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER))
-        places[i] = (ratio, at, pairs)
+    every = [
+        grouping(q, model.per[q.name], groups[model.per[q.name]], model.spreads.get(q.name))
+        for q in model.params
+        if q.name in model.per
+    ]
+    own = [q for each in every for q in each.own]
     for q in (*inputs, *own):
         if q.name in taken:
             raise ModelError(f"sim: the name {q.name} is needed for groups, but it is taken; choose another name")
@@ -70,23 +113,38 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
 
     def of_group(u: Symbol, p: Symbol) -> Symbol:
         """Return the parameters of the group that a row is of."""
-        values = [p[i] for i in range(n)]
-        for i, (ratio, spread, pairs) in places.items():
-            off = p[spread] * sum((u[j] * p[k] for j, k in pairs[1:]), u[pairs[0][0]] * p[pairs[0][1]])
-            values[i] = p[i] * casadi.exp(off) if ratio else p[i] + off
-        return column(model.symbol, values)
+        known = {q.name: p[i] for i, q in enumerate((*model.params, *own))}
+        known |= {name: u[nu + j] for j, name in enumerate(slots)}
+        values = {each.parameter: each.value(known) for each in every}
+        return column(model.symbol, [values.get(q.name, p[i]) for i, q in enumerate(model.params[:n])])
 
+    by_slot = {name: by for by, names in groups.items() for name in slot_names(by, names)}
     return replace(
         model,
         inputs=(*model.inputs, *inputs),
         params=(*model.params, *own),
         rhs=lambda x, u, p: model.rhs(x, u[:nu], of_group(u, p)),
         output=lambda x, u, p: model.output(x, u[:nu], of_group(u, p)),
-        covariates=model.covariates | {name: by for by, names in slots.items() for name in names},
+        covariates=model.covariates | by_slot,
         coordinates=None,
         groups=groups,
         base=model,
     )
+
+
+def refuse_late(model: Model, parameter: str, key: str) -> None:
+    """Refuse a parameter that a delay or a lag depends on.
+
+    Raises:
+        ModelError: `key` says that it differs from group to group.
+
+    """
+    for what, times in (("delay", model.delay), ("lag", model.lag)):
+        for name, value in times.items():
+            if value == parameter:
+                raise ModelError(
+                    f"{key}: sim.inputs.{name}.{what} depends on it, and a {what} is the same for all groups; leave `per` out"
+                )
 
 
 def spreads_of(params: Sequence[Quantity]) -> dict[int, list[int]]:
@@ -108,6 +166,11 @@ def slots_of(model: Model) -> tuple[tuple[int, ...], ...]:
     return tuple(found)
 
 
+def slot_names(by: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the inputs that say which group a row is of; the last is of one that was never seen."""
+    return tuple(f"{by}_is_{word}" for word in words((*names, UNSEEN)))
+
+
 def words(names: tuple[str, ...]) -> list[str]:
     """Return a word for every name that an expression can hold, no two alike."""
     found: list[str] = []
@@ -119,4 +182,7 @@ def words(names: tuple[str, ...]) -> list[str]:
 
 def _most(q: Quantity, *, ratio: bool) -> float:
     """Largest spread: half of the range, so that two standard deviations reach over all of it and more."""
-    return math.log(q.high / q.low) / 2 if ratio else (q.high - q.low) / 2
+    if not ratio:
+        return (q.high - q.low) / 2
+    ends = sorted((abs(q.low), abs(q.high)))
+    return math.log(ends[1] / ends[0]) / 2 if ends[0] > 0 else OF_ZERO

@@ -112,6 +112,8 @@ class Model:
             row. Held where nothing is said.
         covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
         per: uncertain parameter -> column of the groups from one to another of which it differs (`simulators.groups`).
+        spreads: such a parameter -> range of its spread, where one was given.
+        asked: further columns of groups -> the key of an effect that names them.
         groups: column -> names of the groups, where they are known: then inputs and parameters of groups are there.
         base: the model without them; None: this is it.
         limits: state -> lowest and highest value, to which it is clipped after each Runge-Kutta step, never inside one.
@@ -139,6 +141,8 @@ class Model:
     between_rows: dict[str, str] = field(default_factory=dict)
     covariates: dict[str, str] = field(default_factory=dict)
     per: dict[str, str] = field(default_factory=dict)
+    spreads: dict[str, tuple[float, float]] = field(default_factory=dict)
+    asked: dict[str, str] = field(default_factory=dict)
     groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
     base: "Model | None" = None
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -146,6 +150,13 @@ class Model:
     latency: dict[str, float] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
+
+    @property
+    def columns_of_groups(self) -> dict[str, str]:
+        """Columns that name groups, each with the key that named it first."""
+        return {by: f"sim.parameters.{name}.per" for name, by in reversed(self.per.items())} | {
+            by: key for by, key in self.asked.items() if by not in self.per.values()
+        }
 
     def memory(self) -> float:
         """Return how far back inputs act, s: the longest delay and three time constants of the longest lag."""
@@ -217,9 +228,9 @@ class Declared:
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
-            {unit, range, prior: uniform|normal|lognormal, per: COLUMN} (uncertain, see `Quantity`; with `per` it differs from
-            group to group, see `simulators.groups`), or {unit, range, column} (known in
-            every row by a column of the measurements, such as a payload).
+            {unit, range, prior: uniform|normal|lognormal, per: COLUMN, spread: [low, high]} (uncertain, see `Quantity`; with
+            `per` it differs from group to group, by a `spread` that may have a range, see `simulators.groups`), or {unit,
+            range, column} (known in every row by a column of the measurements, such as a payload).
         intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
             in any order; a name that dynamics and outputs can use.
         tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of
@@ -275,6 +286,7 @@ class Declared:
             )
         self._check_dynamics()
         params, fixed, derived = read_parameters(self.parameters)
+        per, spreads = read_groupings(self.parameters)
         sections = (self.states, self.inputs, self.parameters, self.intermediates, self.tables)
         tables = read_tables(self.tables, (name for section in sections for name in section))
         defined = in_order(read_intermediates(self.intermediates) | tables, "write one of them without the others")
@@ -313,7 +325,8 @@ class Declared:
             lag=read_times("lag", self.inputs, params, fixed),
             between_rows=read_between_rows(self.inputs),
             covariates=columns,
-            per=read_groupings(self.parameters),
+            per=per,
+            spreads=spreads,
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },

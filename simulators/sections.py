@@ -32,6 +32,9 @@ PROPERTIES: dict[str, Schema] = {
     "lag": NUMBER_OR_NAME | {"description": "Time constant of a first-order lag, s, or the parameter that says so."},
     "between_rows": {"enum": list(BETWEEN_ROWS), "description": "What the input does from one row to the next."},
     "per": {"type": "string", "description": "Column that names the groups from one to another of which it differs."},
+    "spread": pair(
+        NUMBER, "[low, high] of how far groups differ, one sd; of the logarithm where the range has one sign."
+    ),
     "column": {"type": "string", "description": "Column of the measurements that knows the parameter in every row."},
     "prior": {"enum": list(PRIORS), "description": "Law of an uncertain parameter; normal: the range is +-2 sd."},
     "value": TERM | {"description": "Of a parameter: the known number. Of an input: the expression in its place."},

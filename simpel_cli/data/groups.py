@@ -15,7 +15,7 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
     """Return the groups of the training rows, by column, in order of appearance.
 
     Args:
-        model: with parameters that differ per group.
+        model: that names the columns.
         table: has the columns.
         rows: of it, split.
 
@@ -23,25 +23,23 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
         DataError: a column is missing, has one group only or one in every row, or changes within an episode.
     """
     found = {}
-    for name, column in model.per.items():
-        if column in found:
-            continue
-        labels = _labels(table, column, f"sim.parameters.{name}.per")[rows.number]
+    for column, key in model.columns_of_groups.items():
+        labels = _labels(table, column, key)[rows.number]
         train = rows.split == "train"
         names = tuple(dict.fromkeys(label for label in labels[train].tolist() if label))
         if len(names) < LEAST:
             raise DataError(
-                f"sim.parameters.{name}.per: column '{column}' has {len(names)} group in the training rows"
-                f"{f' ({names[0]})' if names else ''}, which tells nothing of a spread. Leave `per` out, or train on more "
+                f"{key}: column '{column}' has {len(names)} group in the training rows"
+                f"{f' ({names[0]})' if names else ''}, which tells nothing of a spread. Leave it out, or train on more "
                 "groups."
             )
         if len(names) > 0.5 * train.sum():
             raise DataError(
-                f"sim.parameters.{name}.per: column '{column}' has {len(names)} groups in {int(train.sum())} training rows: "
+                f"{key}: column '{column}' has {len(names)} groups in {int(train.sum())} training rows: "
                 "it names rows, not groups. Name a column that is the same over whole episodes."
             )
         if rows.next_states.shape[1] == 0:
-            _refuse_changes(rows, labels, column, name)
+            _refuse_changes(rows, labels, column, key)
         found[column] = names
     return found
 
@@ -69,11 +67,11 @@ def _labels(table: Table, column: str, key: str) -> np.ndarray:
     return table.labels(column)
 
 
-def _refuse_changes(rows: Rows, labels: np.ndarray, column: str, name: str) -> None:
+def _refuse_changes(rows: Rows, labels: np.ndarray, column: str, key: str) -> None:
     changes = (labels[1:] != labels[:-1]) & (rows.episode[1:] == rows.episode[:-1])
     if changes.any():
         i = int(np.flatnonzero(changes)[0])
         raise DataError(
-            f"sim.parameters.{name}.per: column '{column}' changes from '{labels[i]}' to '{labels[i + 1]}' within episode "
+            f"{key}: column '{column}' changes from '{labels[i]}' to '{labels[i + 1]}' within episode "
             f"{rows.episode[i]}. A group is the same over an episode: name the episodes (data.episode), or another column."
         )

@@ -91,7 +91,7 @@ def read(
     told = values.filled(rows)
     report += [check(told, model, mapping.outputs) for check in (values.constant, values.ranges)]
     groups: dict[str, tuple[str, ...]] = {}
-    if isinstance(model, Model) and model.per:
+    if isinstance(model, Model) and model.columns_of_groups:
         groups = known or group_names(model, table, rows)
         rows = with_groups(rows, table, groups)
     if config.layout == "transitions":

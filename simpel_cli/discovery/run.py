@@ -37,12 +37,13 @@ from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.setup import setup, terms_of
+from simpel_cli.discovery.search.setup import members, setup, terms_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.corrected import corrected
 from simpel_cli.discovery.verdict.evidence import evidence_tables
+from simpel_cli.discovery.verdict.groups import sentence_of as of_groups
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
@@ -197,7 +198,7 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
     plan = shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal)
-    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room
+    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room + members(plan)
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
     assessor = Assessor(plan, options.horizon)
     found = calibrated(plan, fitter, assessor, clean, terminal)
@@ -236,7 +237,7 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, began: f
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
-    found["summary"] += sentence_of(between_rows) + sentence_of_tails(nu) + caveats(found)
+    found["summary"] += of_groups(found["groups"]) + sentence_of(between_rows) + sentence_of_tails(nu) + caveats(found)
     return found
 
 
@@ -268,6 +269,8 @@ def _correct(
     for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
         file.parent.mkdir(parents=True)
         write_text(file, content)
+    # groups that only the search was about are no inputs of what is fitted
+    declared = declared.without("effect", "discovery")
     after = declared.changed(sim=node)
     added: dict[str, Any] = {
         "corrected_sim": str(path.relative_to(directory)),

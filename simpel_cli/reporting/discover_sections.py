@@ -45,6 +45,7 @@ def sections_of(
         step_section(found),
         *pictures.values(),
         prior_section(found),
+        group_section(found),
         parameter_section(found, tables.get("parameters", {})) | {k: own[k] for k in ("image", "width") if k in own},
         remainder_section(found),
         not_found_section(found),
@@ -236,6 +237,30 @@ def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
         "note": "With 90 % intervals. A parameter whose interval fills its range is not determined by these data"
         + ("; one that changes a lot compensated for the missing effect." if found["effects"] else "."),
     }
+
+
+def group_section(found: Mapping[str, Any]) -> Section:
+    """Values of the parameters that differ from group to group."""
+    rows = []
+    for entry in found.get("groups") or []:
+        name = with_unit(entry["parameter"], entry["unit"]) + (f", {words(entry['effect'])}" if entry["effect"] else "")
+        gain = f"{entry['log_evidence_gain']:.1f} nat"
+        rows.append([name, f"all ({entry['per']})", _interval(entry["common"]), gain])
+        rows.append([name, f"spread, of its {entry['spread']['of']}", _interval(entry["spread"]), ""])
+        rows += [[name, group, _interval(value), ""] for group, value in entry["values"].items()]
+    if not rows:
+        return {}
+    return {
+        "title": "Values per group",
+        "head": ["", "group", "value (90 %)", "evidence"],
+        "rows": rows,
+        "note": "Values about a common one, with a spread (one standard deviation) that the data told: a group with few rows "
+        "keeps near the common value. Evidence: loss in log evidence with one value for all groups.",
+    }
+
+
+def _interval(value: Mapping[str, float]) -> str:
+    return with_interval(value["value"], value["low"], value["high"])
 
 
 def remainder_section(found: Mapping[str, Any]) -> Section:

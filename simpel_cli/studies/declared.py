@@ -37,14 +37,16 @@ class Declared(NamedTuple):
     def source(self) -> Source:
         """The simulator, a symbolic model or a world with query access only.
 
-        Data may say what inputs do between rows, and how late its outputs are recorded, in place of what it says itself.
+        Data may say what inputs do between rows, and how late its outputs are recorded, in place of what it says itself;
+        effects say which columns name groups.
         """
         found, data = self.groups["sim"], self.groups.get("data")
         said: dict[str, str] = dict(data.between_rows) if isinstance(data, Measurements) else {}
         if isinstance(found, Model):
-            if isinstance(data, Measurements) and data.latency:
-                found = replace(found, latency=data.latency_over(found.latency))
-            return replace(found, between_rows=found.between_rows | said) if said else found
+            late = (
+                data.latency_over(found.latency) if isinstance(data, Measurements) and data.latency else found.latency
+            )
+            return replace(found, between_rows=found.between_rows | said, latency=late, asked=self._columns_of_groups)
         linear = [name for name, word in said.items() if word == "linear"]
         if linear:
             raise ConfigError(
@@ -52,6 +54,11 @@ class Declared(NamedTuple):
                 "its inputs. Give held, or a simulator in symbols."
             )
         return found
+
+    @property
+    def _columns_of_groups(self) -> dict[str, str]:
+        """Columns of groups that effects name, each with the key that does."""
+        return {e.per: f"effect.{e.name}.per" for e in self.groups.get("effect") or () if e.per}
 
     @property
     def measurements(self) -> Measurements:

@@ -12,7 +12,9 @@ from simulators.effects.structure import structure
 from simulators.effects.term import INPUT, NAMED, RATE, SENSOR, EffectParameter, Term
 from simulators.effects.vehicle import PARTS, Vehicle, vehicle
 from simulators.expression import RESERVED, parse
+from simulators.groups import Grouping, grouping
 from simulators.model import Model, ModelError
+from simulators.quantity import Quantity
 
 PLANAR = "planar"  # a vehicle in the plane: a term per part of it
 ROLES = ("velocity", "angle_velocity", "first_order", "input", "measured", "measured_angle", PLANAR)
@@ -55,6 +57,8 @@ class Expression:
         parameters: name -> {range: [low, high], unit, neutral: 0, starts: [...]}. Numbers, or expressions of the scales A
             (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
             A, V of the vehicle's speed, W, Q of its yaw rate (largest magnitude, typical rate).
+        per: column of the measurements that names groups, from one to another of which its strength differs: the parameters
+            that are 0 where it is switched off (all, where there are none) have a common value and one per group.
         same_as: effects that no data can tell from this one.
         units: unit or units of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
@@ -72,6 +76,7 @@ class Expression:
     same_as: tuple[str, ...] = ()
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
+    per: str = ""
 
     def __post_init__(self) -> None:
         where = f"effect.{self.name}"
@@ -96,6 +101,10 @@ class Expression:
             raise ModelError(
                 f"{where}.term: {self.term!r} has both `other` and `around`; one effect is an exchange with one"
             )
+        if not isinstance(self.per, str) or not (self.per.isidentifier() or not self.per):
+            raise ModelError(f"{where}.per: {self.per!r} is not the name of a column (letters, digits, underscores)")
+        if self.per and self.operator:
+            raise ModelError(f"{where}.per: a {self.operator} is the same for all groups; leave `per` out")
         for name, node in self.parameters.items():
             if not (
                 isinstance(node, Mapping) and isinstance(node.get("range"), list | tuple) and len(node["range"]) == 2
@@ -187,7 +196,7 @@ class Expression:
             parameters = self._parameters(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
             swap = own | {role: other} | {k.label: k.name for k in parameters}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
-            found.append(self._term(name, kind, text, parameters))
+            found.append(self._term(name, kind, text, parameters, model))
         return found
 
     def _on_vehicle(self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales) -> list[Term]:
@@ -215,7 +224,7 @@ class Expression:
                 push = f"({_renamed(text, swap)})"
                 sums[state].append(push if factor == "1" else f"{factor}*{push}")
         several = tuple((state, " + ".join(terms)) for state, terms in sums.items())
-        return [self._term(", ".join(states), RATE, "", parameters, several)]
+        return [self._term(", ".join(states), RATE, "", parameters, model, several)]
 
     def _parameters(
         self, prefix: str, values: Mapping[str, float], unit_of: Mapping[str, str], used: set[str] | None = None
@@ -242,13 +251,33 @@ class Expression:
         kind: str,
         text: str,
         parameters: tuple[EffectParameter, ...],
+        model: Model,
         several: tuple[tuple[str, str], ...] = (),
     ) -> Term:
         return Term(
             self.name, name, kind, text, parameters, self.meaning, tuple(self.same_as), tuple(self.generalises),
             self.dissipative,
             several=several,
+            groupings=self._groupings(parameters, model),
         )  # fmt: skip
+
+    def _groupings(self, parameters: tuple[EffectParameter, ...], model: Model) -> tuple[Grouping, ...]:
+        """Return how its strengths differ from group to group."""
+        if not self.per:
+            return ()
+        if self.per not in model.groups:
+            raise ModelError(f"effect.{self.name}.per: the groups of {self.per!r} are not known to {model.name}")
+        return tuple(differing(k, self.per, model.groups[self.per]) for k in strengths(parameters))
+
+
+def strengths(parameters: tuple[EffectParameter, ...]) -> tuple[EffectParameter, ...]:
+    """Return the parameters that are 0 where an effect is switched off; all of them, where there are none."""
+    return tuple(k for k in parameters if k.neutral == 0) or parameters
+
+
+def differing(parameter: EffectParameter, by: str, names: tuple[str, ...]) -> Grouping:
+    """Return how a parameter of an effect differs between the groups of a column."""
+    return grouping(Quantity(parameter.name, parameter.unit, parameter.low, parameter.high), by, names)
 
 
 def _kind(name: str, model: Model, place: str) -> str:

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from simulators.groups import Grouping
+
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
@@ -46,6 +48,7 @@ class Term(NamedTuple):
         depends_on: arguments of a function without a physical name; empty for named effects.
         constants: numbers of the expression that were read off the measurements, by name; programs take them as
             arguments, so that other measurements share what was compiled.
+        groupings: how its parameters differ from group to group.
         several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate.
     """
 
@@ -61,6 +64,7 @@ class Term(NamedTuple):
     depends_on: tuple[str, ...] = ()
     constants: tuple[tuple[str, float], ...] = ()
     several: tuple[tuple[str, str], ...] = ()
+    groupings: tuple[Grouping, ...] = ()
 
     @property
     def label(self) -> str:

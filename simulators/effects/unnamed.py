@@ -14,6 +14,7 @@ from numpy.polynomial import chebyshev, polynomial
 from simulators.effects.expression import Scales, per
 from simulators.effects.structure import structure
 from simulators.effects.term import RATE, EffectParameter, Term
+from simulators.groups import slots_of
 from simulators.model import Model
 
 BASES = 6
@@ -29,7 +30,9 @@ def unnamed(model: Model, scales: Scales, *, pairs: bool = False) -> list[Term]:
     terms = []
     units = {q.name: q.unit for q in model.states}
     periodic = {q.name for q in model.states if q.periodic}
-    arguments = [q.name for q in (*model.states, *model.inputs)]
+    slots = {i for column in slots_of(model) for i in column}  # which group a row is of is no argument
+    inputs = [q.name for i, q in enumerate(model.inputs) if i not in slots]
+    arguments = [*(q.name for q in model.states), *inputs]
     for name in structure(model).dynamic:
         for argument in arguments:
             if scales.size[argument] <= 0:
@@ -61,7 +64,8 @@ def functions_of_two(model: Model, scales: Scales, bases: int = PAIR_BASES) -> l
 
 
 def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> list[Term]:
-    states, inputs = [q.name for q in model.states], [q.name for q in model.inputs]
+    slots = {i for column in slots_of(model) for i in column}
+    states, inputs = [q.name for q in model.states], [q.name for i, q in enumerate(model.inputs) if i not in slots]
     periodic = {q.name for q in model.states if q.periodic}
     terms: list[Term] = []
     bases = {}

@@ -1,5 +1,7 @@
 """Parameters that differ from group to group, on planted groups."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,7 @@ from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.methods.sysid import SysID, identified
 from simpel_cli.priors.function_prior import SimulatorPrior
 from simpel_cli.scores.gaussian import Gaussian
+from simulators.effects import Expression
 from simulators.groups import UNSEEN, grouped
 from simulators.model import Declared, Model, ModelError
 from simulators.worlds.groups import Group, Spread
@@ -85,7 +88,7 @@ def test_every_group_has_its_own_value_about_a_common_one(made) -> None:
         assert abs(own / truth[name]["c"] - 1) < 0.05
     logs = np.log([truth[name]["c"] for name in data.groups["ball"]])
     assert 0.5 * logs.std() < values["c_spread"] < 2 * logs.std()
-    assert sds[f"c_of_{UNSEEN}"] > 0.7  # nothing is known of it but the population
+    assert f"c_of_{UNSEEN}" not in sds  # nothing is known of it but the population: no fit moves it
     _, _, alike = fitted(slider(), recorded(path, slider()))
     assert noise < 0.3 * alike  # one value for all of them leaves much to noise
 
@@ -129,6 +132,25 @@ def test_what_is_wrong_is_said(made, tmp_path) -> None:
             recorded(file, slider(per="ball"))
     with pytest.raises(ModelError, match=r"sim.parameters.c.per: 3 is not the name of a column"):
         slider(per=3)
+
+
+def test_what_is_wrong_with_groups_of_an_effect_names_its_key(made, tmp_path) -> None:
+    table = pd.read_parquet(made[0])
+    file = tmp_path / "runs.parquet"
+    asks = replace(slider(), asked={"ball": "effect.drag.per"})
+    for change, message in (
+        ({"ball": "one"}, "effect.drag.per: column 'ball' has 1 group"),
+        ({"ball": np.arange(len(table)).astype(str)}, "effect.drag.per: .* it names rows, not groups"),
+    ):
+        table.assign(**change).to_parquet(file)
+        with pytest.raises(DataError, match=message):
+            recorded(file, asks)
+    assert DataError.exit_code == 3
+    for operator in ("delay", "lag"):
+        with pytest.raises(
+            ModelError, match=f"effect.late.per: a {operator} is the same for all groups; leave `per` out"
+        ):
+            Expression("late", acts_on="input", operator=operator, parameters={"d": {"range": [0, 1]}}, per="ball")
 
 
 def test_an_identified_simulator_knows_every_group(made) -> None:

@@ -25,7 +25,7 @@ class Augmented(NamedTuple):
         measured: names of the measured states and outputs, the rows of a measurement.
         function: CasADi function (x, u, p) -> (d(x)/dt, measured); p: parameters of the model, then of all effects,
             then all constants.
-        params: the rows of p; those of constants have one value for range.
+        params: the rows of p, those of each effect followed by its groups'; those of constants have one value for range.
         neutral: (dp,) values at which every term is switched off (the model's own parameters: middle of their prior).
         operators: kind -> (index of the signal, row of p) for delays, lags and plays, of the model and of the terms.
         own_delay: (nu) known delays of the model, s.
@@ -49,6 +49,11 @@ class Augmented(NamedTuple):
         names = [q.name for q in self.params]
         return [names.index(k.name) for k in term.parameters]
 
+    def spreads(self, term: Term) -> dict[int, list[int]]:
+        """Rows of p of the spreads of a term's groups, and of what the groups are; the last group was never seen."""
+        names = [q.name for q in self.params]
+        return {names.index(g.spread.name): [names.index(q.name) for q in g.members] for g in term.groupings}
+
 
 def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Augmented:
     """Attach every term to the model."""
@@ -60,16 +65,22 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
                 Quantity(parameter.name, parameter.unit, parameter.low, parameter.high, prior=parameter.prior)
             )
             neutral.append(parameter.neutral)
+        for grouping in term.groupings:
+            params += grouping.own
+            neutral += [0.0] * len(grouping.own)
     for name, value in dict(c for term in terms for c in term.constants).items():
         params.append(Quantity(name, "1", value, value))
         neutral.append(value)
     x = model.symbol.sym("x", len(model.states), 1)
     u = model.symbol.sym("u", len(model.inputs), 1)
     p = model.symbol.sym("p", len(params), 1)
-    own = p[: len(model.params)]
     names: dict[str, Any] = {name: model.symbol(value) for name, value in model.fixed.items()}
     names |= {q.name: p[i] for i, q in enumerate(params)}
     names |= {q.name: x[i] for i, q in enumerate(model.states)}
+    names |= {q.name: u[j] for j, q in enumerate(model.inputs)}
+    for grouping in (g for term in terms for g in term.groupings):
+        names[grouping.parameter] = grouping.value(names)
+    own = p[: len(model.params)]
     given = [u[j] for j in range(len(model.inputs))]
     for j, q in enumerate(model.inputs):
         for term in terms:

@@ -3,12 +3,12 @@
 On a real rig, evidence alone named a friction with +79 nats while the held-out fit got worse: the gate is mandatory.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis
+from simpel_cli.discovery.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -56,26 +56,58 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     )
     hypotheses = [Hypothesis(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
     found = search.fitter(hypotheses)
-    # how loud the noise is says nothing about the effect: all models fit it anew on what was held out
+    # how loud the noise is says nothing about the effect: all models fit it anew on what was held out. What a group is that
+    # was held out as a whole, only its own rows can tell, at the price that its population asks
+    unseen = [_unseen(search, h.free, windows, h.weight > 0) for h in hypotheses]
     found = search.fitter(
-        [Hypothesis(o.z, search.noise, 1 - hypothesis.weight) for o, hypothesis in zip(found, hypotheses, strict=True)]
+        [
+            Hypothesis(o.z, search.noise + tuple(new), 1 - hypothesis.weight)
+            for o, hypothesis, new in zip(found, hypotheses, unseen, strict=True)
+        ]
     )
+    prices = [_prices(search, o, new, windows) for o, new in zip(found, unseen, strict=True)]
     scored = [
-        (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)]) for i, out in enumerate(folds)
+        (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)], prices[i * len(trials) :])
+        for i, out in enumerate(folds)
     ]
     if unit == "window" and search.plan.spare is not None:
         for names, part, out in _batches(search.plan.spare, len(groups)):
             fits = search.fitter.on(part)([Hypothesis(t.optimum.z, search.noise, out.astype(float)) for t in trials])
-            scored.append((part, out, len(groups) + names, fits))
+            scored.append((part, out, len(groups) + names, fits, [np.zeros(len(out))] * len(trials)))
     if not scored:
         return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]
-    named = np.concatenate([names for _, _, names, _ in scored])
+    named = np.concatenate([names for _, _, names, _, _ in scored])
     likelihood, ahead = [], []
     for k in range(len(trials)):
-        found_by = [(assessor(fits[k].z, part), part, out) for part, out, _, fits in scored]
-        likelihood.append(np.concatenate([_likelihood(a, part)[out] for a, part, out in found_by]))
-        ahead.append(np.concatenate([a.ahead[out] for a, _, out in found_by]))
+        found_by = [(assessor(fits[k].z, part), part, out, price[k]) for part, out, _, fits, price in scored]
+        likelihood.append(np.concatenate([(_likelihood(a, part) - price)[out] for a, part, out, price in found_by]))
+        ahead.append(np.concatenate([a.ahead[out] for a, _, out, _ in found_by]))
     return [_judged(likelihood[0] - likelihood[k], ahead[k], ahead[0], named, unit) for k in range(1, len(trials))]
+
+
+def _unseen(search: Search, free: Sequence[int], windows: Windows, kept: np.ndarray) -> dict[int, np.ndarray]:
+    """Return which of the free unknowns are of groups without a window that is kept, with the windows of these groups."""
+    found = {}
+    for row, slot in search.slot_of.items():
+        own = windows.u[:, -1, slot] == 1
+        if row in free and own.any() and not (own & kept).any():
+            found[row] = own
+    return found
+
+
+def _prices(search: Search, found: Optimum, unseen: Mapping[int, np.ndarray], windows: Windows) -> np.ndarray:
+    """Return what windows of unseen groups pay for what they say of their group, nats (W,).
+
+    log p(y_g) = log p(y_g | delta_g) - delta_g^2/2 + log(sd of delta_g), by Laplace.
+    """
+    price = np.zeros(len(windows.episode))
+    coordinates = search.plan.coordinates
+    for row, own in unseen.items():
+        k, span = found.free.index(row), coordinates.high[row] - coordinates.low[row]
+        at = coordinates.value(row, float(found.z[row]))
+        log_sd = 0.5 * np.log(max(float(found.covariance[k, k]) * span**2, 1e-12))
+        price[own] += (0.5 * at**2 - min(log_sd, 0.0)) / own.sum()
+    return price
 
 
 def _likelihood(found: Assessment, windows: Windows) -> np.ndarray:

@@ -55,7 +55,11 @@ def promises(
     room = width - len(known)
     groups: list[list[int]] = []
     for i, (term, hypothesis) in enumerate(starts):
-        if not any(k.neutral == 0 for k in terms[term].parameters) or _late(plan, term, rows[term][0], hypothesis):
+        if (
+            terms[term].groupings
+            or not any(k.neutral == 0 for k in terms[term].parameters)
+            or _late(plan, term, rows[term][0], hypothesis)
+        ):
             continue
         for group in groups:
             used = {starts[j][0] for j in group}

@@ -281,7 +281,7 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
     starts = []
     for z, new, other in ((chosen.optimum.z, function, rival), (rival.optimum.z, own, chosen)):
         z = search.loud(z)
-        rows = list(search.rows[new])
+        rows = search.all_rows(new)
         z[rows] = other.optimum.z[rows]
         starts.append(Hypothesis(z, search.free(terms), search.ones))
     whole = search.best(terms, search.fitter(starts))

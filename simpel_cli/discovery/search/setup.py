@@ -23,6 +23,7 @@ MOST_SPARE = 4  # times the rows of a search: windows that are held out for free
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
+MOST_GROUPED = 2  # effects that differ between groups and act at once
 PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
 
 
@@ -160,6 +161,12 @@ def questions(model: Model) -> list[Term]:
         for q in model.inputs
         if q.name not in model.between_rows and q.name not in model.covariates and model.states
     ]  # fmt: skip
+
+
+def members(plan: Setup) -> int:
+    """Return the number of groups that the two terms have with the most of them: room that a hypothesis needs for these."""
+    counts = sorted(sum(len(g.names) for g in t.groupings) for t in plan.augmented.terms)
+    return sum(counts[-MOST_GROUPED:])
 
 
 def key_of(term: Term) -> Key:

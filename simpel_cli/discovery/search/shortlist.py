@@ -78,7 +78,7 @@ def _gains(plan: Setup, z: np.ndarray, force: Force, inputs: np.ndarray, terms: 
     wanted = wanted - basis @ (basis.T @ wanted)
     found = []
     for term in terms:
-        if term.kind in (*OPERATORS, SENSOR):
+        if term.groupings or term.kind in (*OPERATORS, SENSOR):
             found.append(np.inf)
             continue
         best = 0.0

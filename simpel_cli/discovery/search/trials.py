@@ -12,9 +12,10 @@ import numpy as np
 from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
 from simulators.effects.term import BETWEEN_ROWS
-from simulators.groups import spreads_of
+from simulators.groups import slot_names, spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -29,8 +30,7 @@ ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse tha
 NEARLY = 0.01  # of a parameter's range
 QUIETER = 0.1  # of the range of log q, than at the very start
 STARTS = 6  # of the model as it is
-SPREADS = (0.03, 0.1, 0.2, 0.35, 0.6, 1.0)  # of groups, of their largest
-MORE_SPREADS = 3  # by expectation from the best of these
+SPREADS = (0.03, 0.1, 0.35, 1.0)  # of groups, of their largest
 
 
 def asked(effects: int) -> float:
@@ -56,25 +56,37 @@ class Stage(NamedTuple):
 class Search:
     """The search over sets of effects of one setup."""
 
-    def __init__(self, plan: Setup, fitter: Fitter, report: Callable[[str], None] = lambda _: None) -> None:
-        self.plan, self.fitter, self.report = plan, fitter, report
+    def __init__(self, plan: Setup, fitter: Fitter | Spreading, report: Callable[[str], None] = lambda _: None) -> None:
+        self.plan, self.report = plan, report
         self.terms = plan.augmented.terms
         n_p, n_r, n_q = plan.coordinates.sizes
         params = plan.augmented.model.params
-        # a spread of groups and what the groups are have no common optimum: it is chosen by the evidence, and moves no more
-        self.spreads = spreads_of(params)
-        self.always = tuple(i for i in range(len(params)) if i not in self.spreads) + tuple(range(n_p, n_p + n_r + n_q))
+        self.own = spreads_of(params)
+        last = {rows[-1] + 1 for rows in self.own.values()}  # of what was never seen the data tell nothing
+        self.always = tuple(i for i in range(len(params)) if i not in self.own and i not in last)
+        self.always += tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
+        differing = [plan.augmented.spreads(t) for t in self.terms]
+        self.members = [tuple(i for own in each.values() for i in own[:-1]) for each in differing]
+        self.spreads = self.own | {row: own[:-1] for each in differing for row, own in each.items()}
+        self.slot_of = _slots(plan, self.own)
+        self.spreads_of = [tuple(each) for each in differing]
+        inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
+        self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
-        # terms that are no candidates: what an input does between rows is decided beforehand
+        # terms that are no candidates: what an input does between rows is asked separately
         self.banned = {t for t, term in enumerate(self.terms) if term.kind == BETWEEN_ROWS}
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
         """Unknowns that move when these terms are there."""
-        return self.always + tuple(row for t in terms for row in self.rows[t])
+        return self.always + tuple(row for t in terms for row in (*self.rows[t], *self.members[t]))
+
+    def all_rows(self, term: int) -> list[int]:
+        """Return every unknown of a term, with those of its groups."""
+        return [*self.rows[term], *self.spreads_of[term], *self.members[term]]
 
     def fits(self, terms: Sequence[int]) -> bool:
         """Whether the compiled program has room for them."""
@@ -88,10 +100,11 @@ class Search:
         """Starts of a set of terms of which one is new and begins at each of its start points."""
         parameters = self.terms[new].parameters
         hypotheses = []
-        for s in range(max(len(k.starts) for k in parameters)):
+        for s in range(max((len(k.starts) for k in parameters), default=1)):
             start = self.loud(z)
             for row, parameter in zip(self.rows[new], parameters, strict=True):
                 start[row] = self.plan.coordinates.unit(row, parameter.starts[min(s, len(parameter.starts) - 1)])
+            start[list(self.spreads_of[new])] = BEGIN
             hypotheses.append(Hypothesis(start, self.free(terms), self.ones))
         return hypotheses
 
@@ -100,6 +113,7 @@ class Search:
         start = self.loud(before.optimum.z)
         for row in self.rows[new]:
             start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
+        start[list(self.spreads_of[new])] = BEGIN
         return Hypothesis(start, self.free((*before.terms, new)), self.ones)
 
     def loud(self, z: np.ndarray) -> np.ndarray:
@@ -119,7 +133,7 @@ class Search:
         """Switch terms off."""
         z = z.copy()
         for t in terms:
-            rows = list(self.rows[t])
+            rows = self.all_rows(t)
             z[rows] = self.plan.start[rows]
         return z
 
@@ -141,41 +155,13 @@ class Search:
                 "with max(., 1e-9)."
             )
         best = self.best((), found)
-        return self._with_spreads(best) if self.spreads else best
+        return self._with_spreads(best) if self.own else best
 
     def _with_spreads(self, base: Trial) -> Trial:
-        """Choose the spreads of groups by the evidence: the same share of their ranges first, then by expectation."""
-        free = self.free(())
-        starts = [self._respread(base.optimum, dict.fromkeys(self.spreads, level)) for level in SPREADS]
-        best = self.best((), self.fitter([Hypothesis(z, free, self.ones) for z in starts]))
-        for _ in range(MORE_SPREADS):
-            sizes = {row: float(best.optimum.z[row]) * self._squared(best.optimum, row) ** 0.5 for row in self.spreads}
-            z = self._respread(best.optimum, {row: float(np.clip(s, 0.01, 1.0)) for row, s in sizes.items()})
-            (found,) = self.fitter([Hypothesis(z, free, self.ones)])
-            if not found.log_evidence > best.optimum.log_evidence:
-                break
-            best = self.best((), [found])
-        return best
-
-    def _squared(self, optimum: Optimum, row: int) -> float:
-        """Mean expected square of what the groups are, in standard deviations of the population."""
-        own = []
-        for i in self.spreads[row]:
-            k, span = optimum.free.index(i), self.plan.coordinates.high[i] - self.plan.coordinates.low[i]
-            own.append(
-                self.plan.coordinates.value(i, float(optimum.centre[k])) ** 2 + optimum.covariance[k, k] * span**2
-            )
-        return float(np.mean(own))
-
-    def _respread(self, optimum: Optimum, levels: dict[int, float]) -> np.ndarray:
-        """Return a start with other spreads in which the groups are where they were."""
-        z = optimum.z.copy()
-        for row, level in levels.items():
-            ratio = max(float(z[row]), 1e-3) / level
-            for i in self.spreads[row]:
-                z[i] = self.plan.coordinates.unit(i, ratio * self.plan.coordinates.value(i, float(z[i])))
-            z[row] = level
-        return z
+        """Begin with several spreads of groups, the same share of their ranges, of which each goes on by itself."""
+        z, free = base.optimum.z, self.free(())
+        starts = [respread(self.plan.coordinates, z, dict.fromkeys(self.own, level), self.own) for level in SPREADS]
+        return self.best((), self.fitter([Hypothesis(start, free, self.ones) for start in starts]))
 
     def best(self, terms: tuple[int, ...], found: Sequence[Optimum]) -> Trial:
         """Return the best of some fits of one set of terms, or an earlier one that was better."""
@@ -310,3 +296,21 @@ class Search:
             return False
         fits = len(term.parameters) <= len(self.terms[own].parameters) and here.loss <= there.loss + SAME
         return fits or here.log_evidence >= there.log_evidence - TIE
+
+
+def _slots(plan: Setup, own: dict[int, list[int]]) -> dict[int, int]:
+    """Return what every group is -> the input that says that a row is of it."""
+    model = plan.augmented.model
+    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
+    found = {
+        names.index(q.name): inputs.index(slot)
+        for term in plan.augmented.terms
+        for g in term.groupings
+        for q, slot in zip(g.members, g.slots, strict=True)
+    }
+    per = list(model.base.per.values()) if model.base else []
+    for column, rows in zip(per, own.values(), strict=True):
+        found |= {
+            row: inputs.index(slot) for row, slot in zip(rows, slot_names(column, model.groups[column]), strict=False)
+        }
+    return found

@@ -42,7 +42,7 @@ def _pushes(search: Search, chosen: Trial, term: int, fitted: Trial, x: np.ndarr
     coordinates, function = search.plan.coordinates, search.plan.augmented.function
     off = search.off(chosen.optimum.z, chosen.terms)
     on = off.copy()
-    rows = list(search.rows[term])
+    rows = search.all_rows(term)
     on[rows] = fitted.optimum.z[rows]
     rates = []
     for z in (on, off):

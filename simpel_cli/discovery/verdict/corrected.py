@@ -5,13 +5,15 @@ import re
 from typing import Any
 
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.verdict.groups import differing, spread_of
 from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simulators.effects import Term
 from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR
-from simulators.model import Model
+from simulators.model import Declared, Model
 from simulators.quantity import READING
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
+STIFF = 8  # Runge-Kutta steps per row: groups at the far end of a population move faster than any that was seen
 NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
 _SENSOR = "a simulator describes the system, not its sensors: correct the measurements instead"
 CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
@@ -22,7 +24,8 @@ CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
 def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
     """Return name, YAML and what could not be written, each with the reason.
 
-    Priors of the effects' parameters are normal, with the 95 % interval of the fit for range; the simulator's own
+    Priors of the effects' parameters are normal, with the 95 % interval of the fit for range, and likewise the spread of
+    one that differs from group to group; the simulator's own
     keep the ranges that the user declared.
 
     Args:
@@ -37,6 +40,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
     readings = {q.name for q in model.states if q.role == READING}
     cannot = {t: _SENSOR if readings & t.rates.keys() else CANNOT.get(t.kind) for t in terms}
+    spread = {one.row: one for one in differing(search, trial)}
     written: list[Term] = []
     names: dict[str, str] = {}
     parameters: dict[str, Any] = {}
@@ -58,6 +62,9 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             parameters[short] = (
                 {"unit": parameter.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
             )
+            if row in spread and low < high:
+                ends = spread_of(search, trial, spread[row], Z95)
+                parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
     write = _declared if sim.get("_target_", DECLARED) == DECLARED else _extended
     node = write(sim, name, written, names, parameters)
     return name, node, [f"{t.label} ({cannot[t]})" for t in terms if cannot[t]]
@@ -89,6 +96,8 @@ def _declared(
     """Return a declared simulator with the terms, in the order in which they were attached, as the augmented model has them."""
     node = {key: dict(value) if isinstance(value, dict) else value for key, value in sim.items()}
     node["name"] = name
+    if any("per" in own for own in parameters.values() if isinstance(own, dict)):
+        node["substeps"] = max(int(sim.get("substeps", Declared.substeps)), STIFF)
     node["parameters"] = (node.get("parameters") or {}) | parameters
     given: dict[str, str] = {}
     for term in terms:

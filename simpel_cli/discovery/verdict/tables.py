@@ -12,6 +12,7 @@ from simpel_cli.discovery.search.errors_ahead import SETTLE, Assessment
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import interval_of
+from simulators.groups import MEMBER, SPREAD
 
 DRAWS = 2000  # of a bootstrap
 HORIZONS = ("one_step", "horizon", "free_run")
@@ -171,7 +172,11 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
 
     Parameters of effects have no `before`, and `effect` says whose they are.
     """
-    own = [(q.name, "", q.unit, q.low, q.high, i) for i, q in enumerate(search.plan.augmented.model.params)]
+    own = [
+        (q.name, "", q.unit, q.low, q.high, i)
+        for i, q in enumerate(search.plan.augmented.model.params)
+        if q.role not in (SPREAD, MEMBER)
+    ]
     added = [
         (parameter.label, search.terms[t].label, parameter.unit, parameter.low, parameter.high, row)
         for t in selection.chosen.terms

@@ -12,12 +12,14 @@ from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases
+from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of
+from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
 LOST = -20.0  # nats: a fit so far below the simpler model has not converged, and its size has no meaning
 SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
-Z90, Z95 = 1.6448536269514722, 1.959963984540054
+Z95 = 1.959963984540054
 
 
 def verdict_of(
@@ -82,6 +84,9 @@ def verdict_of(
             "share_after": _shaken(search, chosen),
         },
         "gate": [g._asdict() for g in gates],
+        "groups": groups_of(
+            search, chosen, {o.row: interval_of(search, chosen, o.row) for o in differing(search, chosen)}
+        ),
         "not_found": _not_found(search, selection),
         "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
         "next_experiment": None,
@@ -168,6 +173,7 @@ def _parameters(search: Search, base: Trial, chosen: Trial) -> dict[str, Any]:
     return {
         q.name: {"before": interval_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
         for i, q in enumerate(search.plan.augmented.model.params)
+        if q.role not in (SPREAD, MEMBER)
     }
 
 

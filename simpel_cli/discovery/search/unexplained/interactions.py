@@ -70,7 +70,7 @@ def interaction(
     kept = {key_of(search.terms[t]) for t in chosen.terms}
     plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows, spare=search.plan.spare)
     _, n_r, n_q = plan.coordinates.sizes
-    unknowns = sum(len(search.terms[t].parameters) for t in chosen.terms) + max(len(t.parameters) for t in going)
+    unknowns = sum(len(search.all_rows(t)) for t in chosen.terms) + max(len(t.parameters) for t in going)
     small = Search(
         plan,
         Fitter(
