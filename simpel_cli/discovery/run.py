@@ -28,7 +28,7 @@ from simpel_cli.discovery.search.between_rows import (
     settled,
     words_of,
 )
-from simpel_cli.discovery.search.calibration import calibrated, shortlisted
+from simpel_cli.discovery.search.calibration import calibrated, shortlisted, with_heavy_tails
 from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
@@ -208,6 +208,11 @@ def _search(study: Study, terminal: Terminal) -> Searched:
         terminal.line(f"beside these effects {in_words(again)}: searching once more", "inputs")
         plan = plan._replace(start=settled(found.search, again))
         found = calibrated(plan, fitter, Assessor(plan, options.horizon), clean, terminal, again)
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    # beside what is left unexplained, no data tell whether tails are heavy
+    heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
+    if heavy is not None:
+        found = heavy
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     search, windows, between_rows = found.search, found.test, again
     outliers = outlier_check(found.clean, plan.augmented.measured)

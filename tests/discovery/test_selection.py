@@ -295,7 +295,6 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
         "begun": lambda _, __, windows: windows,
         "gated": lambda _, __, windows: windows._replace(ok=none_left) if windows.begin[0] else windows,
         "without_new": lambda clean, _, after, __: (clean, after),
-        "heavy_tails": lambda *_: None,
         "Search": lambda *_: table.search,
     }.items():
         monkeypatch.setattr(calibration, name, stub)

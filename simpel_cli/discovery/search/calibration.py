@@ -21,7 +21,6 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
 
-WEIGHINGS = 2  # fits of the simulator with weights from the one before
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
@@ -69,7 +68,7 @@ class Calibrated(NamedTuple):
     test: Windows
     clean: Cleaned
     between_rows: dict[str, Preference]
-    degrees_of_freedom: dict[str, float]
+    degrees_of_freedom: dict[str, float] = {}  # noqa: RUF012
 
 
 def calibrated(
@@ -115,21 +114,33 @@ def calibrated(
         cut = after  # the same or not: values that stand out may be in test episodes alone
         if same:
             break
-    tail = heavy_tails(assessor, base.optimum.z, cut["train"])
-    nu = {} if tail is None else {name: float(1 / t) for name, t in zip(names, tail, strict=True) if t > 0}
-    for _ in range(WEIGHINGS if tail is not None else 0):
-        assert tail is not None
-        cut = {split: weighed(assessor, base.optimum.z, windows, tail) for split, windows in cut.items()}
-        search = Search(
-            search.plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), report
-        )
-        base = search.base()
     search.plan = search.plan._replace(spare=cut.get("spare"))
     report("calibrated")
-    if nu:
-        heavy = ", ".join(f"{name} {value:.3g}" for name, value in nu.items())
-        terminal.line(f"Student's t, degrees of freedom: {heavy}; values that lie far off count less", "noise")
     assert between_rows is not None
     if between_rows:
         terminal.line(in_words(between_rows), "inputs")
-    return Calibrated(search, base, cut["test"], clean, between_rows, nu)
+    return Calibrated(search, base, cut["test"], clean, between_rows)
+
+
+def with_heavy_tails(found: Calibrated, assessor: Assessor, z: np.ndarray, terminal: Terminal) -> Calibrated | None:
+    """Return the calibration with values that count by their weights, where a model's noise has heavy tails; else None.
+
+    Args:
+        found: in which every value counts alike.
+        assessor: of errors ahead.
+        z: unit coordinates of the model that was chosen. What a simulator lacks looks like heavy tails, too: they are judged
+            beside the effects that were found.
+        terminal: takes a line.
+    """
+    plan, names = found.search.plan, found.search.plan.augmented.measured
+    tail = heavy_tails(assessor, z, plan.windows)
+    if tail is None:
+        return None
+    nu = {name: float(1 / t) for name, t in zip(names, tail, strict=True) if t > 0}
+    heavy = ", ".join(f"{name} {value:.3g}" for name, value in nu.items())
+    terminal.line(f"Student's t, degrees of freedom: {heavy}; values that lie far off count less", "noise")
+    given = {"train": plan.windows, "test": found.test} | ({"spare": plan.spare} if plan.spare is not None else {})
+    cut = {part: weighed(assessor, z, windows, tail) for part, windows in given.items()}
+    plan = plan._replace(windows=cut["train"], spare=cut.get("spare"))
+    search = Search(plan, found.search.fitter.on(cut["train"]), found.search.report)
+    return found._replace(search=search, base=search.base(), test=cut["test"], degrees_of_freedom=nu)

@@ -1,12 +1,12 @@
 """Measurement noise with heavy tails: Student's t as a scale mixture, so that a value that lies far off costs itself little.
 
-Given the state, y = h(x) + r, r ~ N(0, R/w), w ~ Gamma(nu/2, nu/2). The smoother of the calibrated simulator tells what all
+Given the state, y = h(x) + r, r ~ N(0, R/w), w ~ Gamma(nu/2, nu/2). The smoother of a model tells what all
 values say of each one; with its residual rho and the variance V of h there,
 
     E[r^2] = rho^2 + V,    w = (nu + 1)/(nu + E[r^2]/R),    rho/sqrt(R/w - V) = error of the value left out, standardised
 
-and nu is the one with which these errors are most probable. A wrong model does not make tails heavy: the process noise lets it
-follow what stays wrong in the next rows. Of Gaussian noise all weights are 1, and nothing changes.
+and nu is the one with which these errors are most probable. A wrong model may look like heavy tails, too, since it errs now
+more, now less: they are judged beside the effects that were found. Of Gaussian noise all weights are 1, and nothing changes.
 
 Reference: Lange, Little and Taylor (1989), Robust statistical modeling using the t distribution; Rauch, Tung and Striebel
 (1965).
@@ -45,7 +45,7 @@ def heavy_tails(assessor: Assessor, z: np.ndarray, windows: Windows) -> np.ndarr
 
     Args:
         assessor: of the models.
-        z: unit coordinates of the calibrated simulator.
+        z: unit coordinates of the model that was chosen.
         windows: in which no value is weighed yet.
     """
     found = _residuals(assessor, z, windows)
