@@ -1,1 +1,1 @@
-"""Finding what a simulator lacks: measurements, likelihood, search, verdict, next experiment; each uses those before it."""
+"""Finding what a simulator lacks: search, verdict, next experiment; each uses those before it, all of them the filter."""

@@ -14,9 +14,6 @@ from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.data import Recording, read
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.measurements.cleaning import cleaned, outlier_check, without_computed
-from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.between_rows import (
@@ -29,7 +26,6 @@ from simpel_cli.discovery.search.between_rows import (
     words_of,
 )
 from simpel_cli.discovery.search.calibration import calibrated, shortlisted, with_heavy_tails
-from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
@@ -37,7 +33,6 @@ from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.setup import members, setup, terms_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
@@ -48,6 +43,11 @@ from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.errors import ConfigError, DataError, Inconclusive
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.measurements.cleaning import cleaned, outlier_check, without_computed
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import members, setup, terms_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
 from simpel_cli.runs.files import write_table, write_text

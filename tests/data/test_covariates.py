@@ -6,11 +6,11 @@ import pandas as pd
 import pytest
 
 from simpel_cli.data import Measurements, read
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup
 from simulators.model import Declared, Model, ModelError
 from simulators.worlds.groups import Covariate
 from simulators.worlds.simulate import Simulate

@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 
 from simpel_cli.data import Measurements, Recording, read, transitions
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.dynamics.domain import Domain
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import DataError
 from simpel_cli.evaluation import test_arrays as arrays_of
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup
 from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.methods.sysid import SysID, identified

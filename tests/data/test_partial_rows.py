@@ -6,11 +6,11 @@ import pytest
 
 from simpel_cli.data import Measurements, Recording, read
 from simpel_cli.data.checks.noise import third_difference_std
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.measurements.cleaning import cleaned
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.measurements.cleaning import cleaned
+from simpel_cli.filtering.setup import setup
 from simulators.model import Declared, Model
 from simulators.worlds.simulate import Simulate
 

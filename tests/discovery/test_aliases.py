@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.fit import Fitter, Optimum
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict.aliases import are_aliases
+from simpel_cli.filtering.likelihood.fit import Fitter, Optimum
+from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression
 from simulators.model import Declared
 

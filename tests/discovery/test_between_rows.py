@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.likelihood.fit import Fitter
 from simpel_cli.discovery.search.between_rows import in_words, preferences, settled
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup
 from simulators.model import Declared, Model
 from simulators.worlds.simulate import Simulate
 

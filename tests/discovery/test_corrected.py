@@ -10,11 +10,11 @@ import yaml
 from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.likelihood.augmented import augment
-from simpel_cli.discovery.likelihood.fit import Optimum
-from simpel_cli.discovery.search.setup import terms_of
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict import corrected as module
+from simpel_cli.filtering.likelihood.augmented import augment
+from simpel_cli.filtering.likelihood.fit import Optimum
+from simpel_cli.filtering.setup import terms_of
 from simulators.effects import Scales, Term
 from simulators.model import Model
 

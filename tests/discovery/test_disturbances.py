@@ -11,10 +11,7 @@ from test_filter import DT
 from test_interactions import FRICTION, NOISE, ROWS
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.selection import Selection, select
-from simpel_cli.discovery.search.setup import setup
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.disturbances import (
     Disturbance,
@@ -24,6 +21,9 @@ from simpel_cli.discovery.search.unexplained.disturbances import (
 )
 from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.discovery.verdict.remainder import dependence, remainder_of
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup
 from simulators.model import Declared, Model
 
 PERIOD = 0.9  # s

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from test_aliases import searched
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis, Optimum
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.held_out_gate import RUNAWAY, gates, harmful
 from simpel_cli.discovery.search.trials import Trial
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.measurements.windows import Windows
 
 
 @pytest.mark.parametrize(

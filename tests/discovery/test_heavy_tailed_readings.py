@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.measurements.cleaning import Cleaned
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, with_heavy_tails
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.heavy_tails import sentence_of
-from simpel_cli.discovery.search.setup import Setup, setup
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.measurements.cleaning import Cleaned
+from simpel_cli.filtering.setup import Setup, setup
 from simpel_cli.runs.console import Terminal
 from simulators.model import Declared, Model
 

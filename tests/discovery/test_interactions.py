@@ -10,20 +10,20 @@ import pytest
 from test_filter import DT, LOAD, model, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.coordinates import CUT
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.selection import Selection, cut, select
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.setup import Setup, key_of, setup
-from simpel_cli.discovery.search.setup import test_windows as windows_of_tests
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.interactions import BASES, carried, names_of
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.verdict import verdict_of
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.coordinates import CUT
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.likelihood.sensitivity import shifts, waves
+from simpel_cli.filtering.setup import Setup, key_of, setup
+from simpel_cli.filtering.setup import test_windows as windows_of_tests
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, functions_of_two
 from simulators.model import Declared

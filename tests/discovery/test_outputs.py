@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.measurements.cleaning import refuse_far
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.measurements.cleaning import refuse_far
 from simulators.model import Declared
 
 

@@ -12,16 +12,16 @@ from test_aliases import searched
 from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
-from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
-from simpel_cli.discovery.measurements.cleaning import Cleaned
 from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
 from simpel_cli.discovery.search.calibration import calibrated
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.selection import cut, further, select
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.measurements.cleaning import Cleaned
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
 

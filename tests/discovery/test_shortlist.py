@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_aliases import searched
 
-from simpel_cli.discovery.likelihood.latent_force import Force
 from simpel_cli.discovery.search import shortlist as module
-from simpel_cli.discovery.search.setup import key_of
 from simpel_cli.discovery.search.shortlist import shortlist
+from simpel_cli.filtering.likelihood.latent_force import Force
+from simpel_cli.filtering.setup import key_of
 from simulators.effects.term import BETWEEN_ROWS
 
 

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.likelihood.latent_force import Force
-from simpel_cli.discovery.measurements.windows import windows_of
-from simpel_cli.discovery.search.errors_ahead import SETTLE, Assessment
 from simpel_cli.discovery.verdict.tables import (
     column_names,
     error_columns,
@@ -17,6 +14,9 @@ from simpel_cli.discovery.verdict.tables import (
     residual_columns,
     trajectory_columns,
 )
+from simpel_cli.filtering.errors_ahead import SETTLE, Assessment
+from simpel_cli.filtering.likelihood.latent_force import Force
+from simpel_cli.filtering.measurements.windows import windows_of
 
 LEAD = 2
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.measurements.windows import Windows, thinned, windows_of
 from simpel_cli.discovery.verdict.verdict import _distinct
+from simpel_cli.filtering.measurements.windows import Windows, thinned, windows_of
 
 
 @pytest.mark.parametrize(

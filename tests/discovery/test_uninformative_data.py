@@ -11,9 +11,9 @@ import pytest
 from command_line import CART, RIG, csv, rig, simpel
 
 from simpel_cli.data import Episode, Recording
-from simpel_cli.discovery.measurements.cleaning import cleaned, is_noise, measured
-from simpel_cli.discovery.measurements.windows import windows_of
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.measurements.cleaning import cleaned, is_noise, measured
+from simpel_cli.filtering.measurements.windows import windows_of
 from simpel_cli.runs.files import strict
 from simulators.model import Declared, Model
 

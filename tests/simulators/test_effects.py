@@ -9,7 +9,7 @@ import yaml
 
 from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
-from simpel_cli.discovery.likelihood.augmented import augment
+from simpel_cli.filtering.likelihood.augmented import augment
 from simulators.effects import Expression, Scales, Term, structure, unnamed
 from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR
 from simulators.model import Declared, Model, ModelError

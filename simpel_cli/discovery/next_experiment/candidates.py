@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.measurements.windows import LONGEST
-from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.filtering.measurements.windows import LONGEST
+from simpel_cli.filtering.setup import Setup
 from simulators.model import Quantity
 from simulators.worlds.excitation import HeldRandom, Multisine
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.next_experiment.candidates import (
     Proposal,
     neighbours,
@@ -31,6 +30,7 @@ from simpel_cli.discovery.next_experiment.discrimination import Forecast, Member
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.verdict.aliases import are_aliases
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.runs.files import write_text
 
 FILE = "next_experiment.csv"

@@ -32,7 +32,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float
 
-from simpel_cli.discovery.likelihood.track import Filter, Noise
+from simpel_cli.filtering.likelihood.track import Filter, Noise
 
 LOG_2PI = float(np.log(2 * np.pi))
 Carry = tuple[Array, Array, Array]

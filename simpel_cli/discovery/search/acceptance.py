@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.interactions import interaction
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
 
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects.term import BETWEEN_ROWS
 
 HELD, LINEAR = "held", "linear"

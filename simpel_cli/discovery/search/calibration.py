@@ -5,19 +5,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Fitter
-from simpel_cli.discovery.likelihood.latent_force import Forces
-from simpel_cli.discovery.measurements.cleaning import Cleaned
-from simpel_cli.discovery.measurements.windows import Windows
 from simpel_cli.discovery.search.between_rows import Preference, in_words, preferences, settled
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.heavy_tails import heavy_tails, weighed
-from simpel_cli.discovery.search.initial_states import begun, moved
 from simpel_cli.discovery.search.outliers import gated, without_new
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.setup import Setup, key_of, test_windows
 from simpel_cli.discovery.search.shortlist import MOST_PARAMETERS, shortlist
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.initial_states import begun, moved
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.likelihood.latent_force import Forces
+from simpel_cli.filtering.measurements.cleaning import Cleaned
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import Setup, key_of, test_windows
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
 

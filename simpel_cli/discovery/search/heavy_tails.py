@@ -18,9 +18,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.discovery.likelihood.latent_force import smooth
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.latent_force import smooth
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.priors.noise_law import TAILS, profile
 
 LEAST_GAIN = 10.0  # nats that Student's t has to be ahead by, as an effect has: a few spikes are left out one by one

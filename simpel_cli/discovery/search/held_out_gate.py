@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis, Optimum
-from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows
-from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 
 MOST_FOLDS = 5
 RUNAWAY = 1e4  # nats that a window costs a model that ran away in it

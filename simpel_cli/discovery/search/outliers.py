@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.likelihood.latent_force import smooth
-from simpel_cli.discovery.measurements.cleaning import MOST_SHARE, Cleaned, Place
-from simpel_cli.discovery.measurements.windows import Windows, pieces
-from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.latent_force import smooth
+from simpel_cli.filtering.measurements.cleaning import MOST_SHARE, Cleaned, Place
+from simpel_cli.filtering.measurements.windows import Windows, pieces
 
 FAR = 6.0  # standard deviations
 FAR_AT_END = 8.0  # of the last row, which no other one confirms

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import LEAST_CURVATURE, Hypothesis, Optimum
-from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis, Optimum
+from simpel_cli.filtering.setup import Setup
 from simulators.effects.term import DELAY
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.augmented import Augmented, augment
-from simpel_cli.discovery.likelihood.latent_force import Force
-from simpel_cli.discovery.search.setup import Key, Setup, key_of
+from simpel_cli.filtering.likelihood.augmented import Augmented, augment
+from simpel_cli.filtering.likelihood.latent_force import Force
+from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term
 from simulators.effects.term import OPERATORS, SENSOR
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.fit import MOST, Fitter, Hypothesis, Optimum
-from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.filtering.likelihood.coordinates import Coordinates
+from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.measurements.windows import Windows
 
 BEGIN = 0.35  # of the largest spread, where a fit begins
 LEAST = 0.01  # of it: groups are alike

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.discovery.search.score_test import Score, promises
-from simpel_cli.discovery.search.setup import Setup
 from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.setup import Setup
 from simulators.effects.term import BETWEEN_ROWS
 from simulators.groups import slot_names, spreads_of
 

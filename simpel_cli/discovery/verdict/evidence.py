@@ -12,9 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.likelihood.latent_force import Forces
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.verdict.tables import (
@@ -29,6 +26,9 @@ from simpel_cli.discovery.verdict.tables import (
     residual_columns,
     trajectory_columns,
 )
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor
+from simpel_cli.filtering.likelihood.latent_force import Forces
+from simpel_cli.filtering.measurements.windows import Windows
 from simulators.effects import Term
 from simulators.effects.expression import per
 from simulators.effects.term import OPERATORS, SENSOR

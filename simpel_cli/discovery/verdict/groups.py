@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Hypothesis
 from simpel_cli.discovery.search.spreads import known
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.groups import Grouping, grouping
 
 DRAWS = 4000  # of the posterior, for the interval of a value per group

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.whiteness import memory
-from simpel_cli.discovery.search.errors_ahead import Assessment
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
+from simpel_cli.filtering.errors_ahead import Assessment
+from simpel_cli.filtering.likelihood.whiteness import memory
 from simulators.effects.expression import per
 
 ALIKE = 0.3  # of an input's variance, at the period of a disturbance

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.likelihood.latent_force import Force
-from simpel_cli.discovery.measurements.windows import Windows, pieces
-from simpel_cli.discovery.search.errors_ahead import SETTLE, Assessment
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import interval_of
+from simpel_cli.filtering.errors_ahead import SETTLE, Assessment
+from simpel_cli.filtering.likelihood.latent_force import Force
+from simpel_cli.filtering.measurements.windows import Windows, pieces
 from simulators.groups import MEMBER, SPREAD
 
 DRAWS = 2000  # of a bootstrap

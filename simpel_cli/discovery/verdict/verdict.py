@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Check
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.selection import Selection
-from simpel_cli.discovery.search.setup import Q_BOUNDS, key_of
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import Q_BOUNDS, key_of
 from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.whiteness import autocorrelation, cumulated_periodogram
+from simpel_cli.filtering.likelihood.whiteness import autocorrelation, cumulated_periodogram
 from simpel_cli.reporting.figures.canvas import (
     BLACK,
     COLOURS,

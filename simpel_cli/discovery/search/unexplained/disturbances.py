@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.sensitivity import shifts
 from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile
+from simpel_cli.filtering.likelihood.sensitivity import shifts
 
 SIZES = (1.0, 0.3, 0.1, 0.03)  # of the typical rate of the state
 CERTAIN = (

@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
-from simpel_cli.discovery.search.setup import Key, Setup, key_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.unexplained.pair_screening import Promise, promised
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 
 BASES = (2, 4)  # waves per argument: a function that needs few is seen sooner with few

@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.fit import LEAST_CURVATURE
-from simpel_cli.discovery.likelihood.latent_force import Forces
-from simpel_cli.discovery.likelihood.track import Track
-from simpel_cli.discovery.search.errors_ahead import Assessor
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
+from simpel_cli.filtering.likelihood.latent_force import Forces
+from simpel_cli.filtering.likelihood.track import Track
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # of the process noise of the state that a force acts on
 NUDGE = 1e-4  # of an unknown's range

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.augmented import Augmented, augment
-from simpel_cli.discovery.likelihood.sensitivity import shifts, waves
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile, evidence
+from simpel_cli.filtering.likelihood.augmented import Augmented, augment
+from simpel_cli.filtering.likelihood.sensitivity import shifts, waves
 from simulators.effects import Term
 
 SIZES = (1.0, 0.3, 0.1)  # of a function, in standard deviations of its prior

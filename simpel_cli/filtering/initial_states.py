@@ -9,9 +9,9 @@ Reference: Bell (1994), The iterated Kalman smoother as a Gauss-Newton method.
 
 import numpy as np
 
-from simpel_cli.discovery.likelihood.latent_force import smooth
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.errors_ahead import Assessor
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.latent_force import smooth
+from simpel_cli.filtering.measurements.windows import Windows
 
 PASSES = 4
 WIDE = 3.0  # standard deviations of the smoother

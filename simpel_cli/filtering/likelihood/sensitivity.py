@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import casadi
 import numpy as np
 
-from simpel_cli.discovery.likelihood.augmented import Augmented
-from simpel_cli.discovery.likelihood.track import Track
+from simpel_cli.filtering.likelihood.augmented import Augmented
+from simpel_cli.filtering.likelihood.track import Track
 from simulators.effects import Term
 
 

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT, Moving
-from simpel_cli.discovery.likelihood.track import Filter, Noise
-from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.filtering.likelihood.coordinates import Coordinates
+from simpel_cli.filtering.likelihood.filter import MOST_KEPT, Moving
+from simpel_cli.filtering.likelihood.track import Filter, Noise
+from simpel_cli.filtering.measurements.windows import Windows
 
 LEAST_CURVATURE = 12.0
 AT_BOUND = 1e-4

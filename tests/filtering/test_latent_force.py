@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.latent_force import Forces, smooth
-from simpel_cli.discovery.likelihood.track import Filter, Track
-from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.filtering.likelihood.coordinates import Coordinates
+from simpel_cli.filtering.likelihood.latent_force import Forces, smooth
+from simpel_cli.filtering.likelihood.track import Filter, Track
+from simpel_cli.filtering.measurements.windows import Windows
 
 DT = 0.1
 

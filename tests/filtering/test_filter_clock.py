@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.filter import Moving
-from simpel_cli.discovery.likelihood.track import Noise
-from simpel_cli.discovery.measurements.windows import clocked
-from simpel_cli.discovery.search.setup import Setup, setup
+from simpel_cli.filtering.likelihood.filter import Moving
+from simpel_cli.filtering.likelihood.track import Noise
+from simpel_cli.filtering.measurements.windows import clocked
+from simpel_cli.filtering.setup import Setup, setup
 from simulators.model import Declared, Model
 
 DT, ROWS, A, B = 0.2, 16, 0.7, 1.3
@@ -83,7 +83,7 @@ def test_readings_are_those_of_the_exact_motion(jitter: float, late: bool) -> No
 
 
 def test_a_free_run_reads_late_values_late() -> None:
-    from simpel_cli.discovery.search.errors_ahead import Assessor
+    from simpel_cli.filtering.errors_ahead import Assessor
 
     measured, _ = recording(0.3, True, noise=1e-6)
     plan = setup(model(), measured, (), [], 4)

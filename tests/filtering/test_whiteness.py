@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.likelihood.whiteness import autocorrelation, cumulated_periodogram, memory
+from simpel_cli.filtering.likelihood.whiteness import autocorrelation, cumulated_periodogram, memory
 
 
 def test_autocorrelation_of_an_autoregression() -> None:

@@ -9,12 +9,12 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.likelihood.filter import Moving
-from simpel_cli.discovery.likelihood.fit import Fitter, Hypothesis
-from simpel_cli.discovery.likelihood.track import Noise
 from simpel_cli.discovery.search.selection import select
-from simpel_cli.discovery.search.setup import Setup, setup
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.filtering.likelihood.filter import Moving
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.likelihood.track import Noise
+from simpel_cli.filtering.setup import Setup, setup
 from simulators.effects import Expression
 from simulators.model import Declared
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from simpel_cli.discovery.likelihood.augmented import Augmented
 from simpel_cli.dynamics.casadi_jax import checked, to_jax_rows
+from simpel_cli.filtering.likelihood.augmented import Augmented
 
 
 class Moving(NamedTuple):

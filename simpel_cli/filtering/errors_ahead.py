@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT
-from simpel_cli.discovery.likelihood.track import Filter, Track
-from simpel_cli.discovery.measurements.windows import Windows
-from simpel_cli.discovery.search.setup import Setup
+from simpel_cli.filtering.likelihood.coordinates import Coordinates
+from simpel_cli.filtering.likelihood.filter import MOST_KEPT
+from simpel_cli.filtering.likelihood.track import Filter, Track
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import Setup
 
 SETTLE = 5  # rows after which the filter knows a state that it started without
 LOG_2PI = float(np.log(2 * np.pi))

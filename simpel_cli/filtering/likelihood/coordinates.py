@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from simpel_cli.discovery.likelihood.augmented import Augmented
-from simpel_cli.discovery.likelihood.track import Noise
+from simpel_cli.filtering.likelihood.augmented import Augmented
+from simpel_cli.filtering.likelihood.track import Noise
 
 CUT = 4.0  # standard deviations at which a normal prior is bounded
 

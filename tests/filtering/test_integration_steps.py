@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.measurements.integration_steps import MOST, TOLERANCE, substeps_needed
+from simpel_cli.filtering.measurements.integration_steps import MOST, TOLERANCE, substeps_needed
 from simulators.effects import Scales
 from simulators.model import Declared
 from simulators.worlds.rk4 import RK4

@@ -9,7 +9,7 @@ with the row before, (x_0, f_0), a step h away. In the state at the row its slop
 
 from jaxtyping import Array, Float
 
-from simpel_cli.discovery.likelihood.small_matrices import product
+from simpel_cli.filtering.likelihood.small_matrices import product
 
 
 def way_back(

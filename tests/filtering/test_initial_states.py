@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.errors_ahead import Assessor
-from simpel_cli.discovery.search.initial_states import begun, moved
-from simpel_cli.discovery.search.setup import Setup, setup
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.initial_states import begun, moved
+from simpel_cli.filtering.setup import Setup, setup
 from simulators.model import Declared
 
 DT, ROWS, EMPTIES, FIRST = 1.0, 40, 0.3, (20.0, 45.0, 70.0, 95.0)

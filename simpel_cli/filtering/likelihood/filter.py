@@ -30,14 +30,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from simpel_cli.discovery.likelihood.augmented import Augmented
-from simpel_cli.discovery.likelihood.derivatives import Moving, Value, movable, still, with_slope
-from simpel_cli.discovery.likelihood.early_values import slope_back, way_back
-from simpel_cli.discovery.likelihood.sensor_delay import back, echo, no_jumps, pushed
-from simpel_cli.discovery.likelihood.small_matrices import along, apart, product
-from simpel_cli.discovery.likelihood.track import Filter, Held, Noise, Track
 from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.dynamics.integrate import at_stages
+from simpel_cli.filtering.likelihood.augmented import Augmented
+from simpel_cli.filtering.likelihood.derivatives import Moving, Value, movable, still, with_slope
+from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
+from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
+from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
+from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
 SMALL = 3  # states of a model whose covariance follows the parameters

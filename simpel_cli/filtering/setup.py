@@ -6,14 +6,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.likelihood.augmented import Augmented, augment
-from simpel_cli.discovery.likelihood.coordinates import Coordinates, coordinates_of
-from simpel_cli.discovery.likelihood.filter import filter_of
-from simpel_cli.discovery.likelihood.track import Filter
-from simpel_cli.discovery.measurements import windows as windows_
-from simpel_cli.discovery.measurements.integration_steps import substeps_needed
-from simpel_cli.discovery.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
 from simpel_cli.errors import ConfigError, DataError
+from simpel_cli.filtering.likelihood.augmented import Augmented, augment
+from simpel_cli.filtering.likelihood.coordinates import Coordinates, coordinates_of
+from simpel_cli.filtering.likelihood.filter import filter_of
+from simpel_cli.filtering.likelihood.track import Filter
+from simpel_cli.filtering.measurements import windows as windows_
+from simpel_cli.filtering.measurements.integration_steps import substeps_needed
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, EffectParameter
 from simulators.model import Model, ModelError

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.discovery.likelihood.coordinates import Coordinates
-from simpel_cli.discovery.likelihood.filter import MOST_KEPT
-from simpel_cli.discovery.likelihood.track import Filter, Track
-from simpel_cli.discovery.measurements.windows import Windows
+from simpel_cli.filtering.likelihood.coordinates import Coordinates
+from simpel_cli.filtering.likelihood.filter import MOST_KEPT
+from simpel_cli.filtering.likelihood.track import Filter, Track
+from simpel_cli.filtering.measurements.windows import Windows
 
 CHUNK = 512  # rows of one call of the compiled flow
 JITTER = 1e-12  # of a covariance scaled to a unit diagonal

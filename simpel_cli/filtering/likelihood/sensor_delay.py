@@ -13,7 +13,7 @@ are held from a row to the next, so y' jumps at the rows. A jump J at age a adds
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.discovery.likelihood.small_matrices import along, product
+from simpel_cli.filtering.likelihood.small_matrices import along, product
 
 JUMPS = 4  # rows that are looked back on
 

@@ -1,1 +1,0 @@
-"""What of a recording the search may use: cleaned columns, windows, steps of the integrator."""

@@ -1,0 +1,1 @@
+"""Continuous-discrete filter of a simulator on measured rows: measurements, likelihood, set-up, errors ahead."""

@@ -1,0 +1,1 @@
+"""Rows as the filter takes them: cleaned columns, windows, steps of the integrator."""
