@@ -35,6 +35,9 @@ class Episode(NamedTuple):
     outputs: np.ndarray  # (T, n_measured_outputs)
     next_states: np.ndarray | None = None  # (T, n_states) where rows do not follow each other (layout: transitions)
     late: np.ndarray | None = None  # (T, n_states + n_measured_outputs) s, how long before its row a value was measured
+    # (T, n_states + n_measured_outputs) variance of a measured value over that of this one: 1 measured, less: estimated, of
+    # states that were not measured in their row; None: every value was measured
+    weight: np.ndarray | None = None
 
 
 class Recording(NamedTuple):
@@ -62,6 +65,13 @@ class Transitions(NamedTuple):
     outputs: np.ndarray  # (n, dy_out), at the row of the inputs
     episode: np.ndarray  # (n,) index of the episode
     row: np.ndarray  # (n,) row in the episode
+    weight: (
+        np.ndarray
+    )  # (n, ds + dy_out) how much change and output count, 1 where they were measured (`Episode.weight`)
+
+    def take(self, rows: np.ndarray) -> "Transitions":
+        """Return some of them."""
+        return Transitions(*(column[rows] for column in self))
 
 
 def transitions(episodes: Sequence[Episode], stack_actions: int, linear: Sequence[int] = ()) -> Transitions:
@@ -91,7 +101,8 @@ def no_transitions(source: Source, outputs: int, stack_actions: int, linear: Seq
     width = (stack_actions + 1) * len(source.inputs) + len(linear)
     states, inputs = np.empty((0, len(source.states))), np.empty((0, width))
     nothing = np.empty(0, int)
-    return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing)
+    weight = np.empty((0, len(source.states) + outputs))
+    return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing, weight)
 
 
 def _of_episode(index: int, episode: Episode, stack: int, linear: Sequence[int]) -> Transitions:
@@ -112,7 +123,19 @@ def _of_episode(index: int, episode: Episode, stack: int, linear: Sequence[int])
         outputs=episode.outputs[rows],
         episode=np.full(len(rows), index),
         row=rows,
+        weight=_weight(episode, rows, n_states),
     )
+
+
+def _weight(episode: Episode, rows: np.ndarray, n_states: int) -> np.ndarray:
+    """Variance of a change between two measured values over that of this one; of an output its own weight."""
+    if episode.weight is None:
+        return np.ones((len(rows), n_states + episode.outputs.shape[1]))
+    change = np.empty((len(rows), 0))
+    if n_states:
+        before, after = episode.weight[rows, :n_states], episode.weight[rows + 1, :n_states]
+        change = 2 / (1 / before + 1 / after)
+    return np.concatenate([change, episode.weight[rows, n_states:]], axis=1)
 
 
 def select(pairs: Transitions, n_train: int | None, choice: str, seed: int) -> Transitions:
@@ -133,7 +156,7 @@ def select(pairs: Transitions, n_train: int | None, choice: str, seed: int) -> T
     if n_train > available:
         raise DataError(f"data.n_train: {n_train} training transitions are asked for, the data have {available}.")
     order = stream(seed, "n_train").permutation(available) if choice == "random" else np.arange(available)
-    return Transitions(*(column[order[:n_train]] for column in pairs))
+    return pairs.take(order[:n_train])
 
 
 def stream(seed: int, name: str) -> np.random.Generator:

@@ -80,6 +80,12 @@ class Encoding:
         spread = [values.get(q.name, default) for q in self.states for _ in range(2 if q.periodic else 1)]
         return np.array([*spread, *(values.get(q.name, default) for q in self.outputs)], dtype=float)
 
+    @property
+    def quantity_of_target(self) -> np.ndarray:
+        """Index of the state, or behind them the output, that every target coordinate is of, (dy,)."""
+        of_states = [i for i, q in enumerate(self.states) for _ in range(2 if q.periodic else 1)]
+        return np.array([*of_states, *range(len(self.states), len(self.states) + len(self.outputs))], dtype=int)
+
     def encode(self, states: Any) -> Any:
         """Map physical states (..., ds) to encoded ones (..., dim_state)."""
         xp = np if isinstance(states, np.ndarray) else jnp

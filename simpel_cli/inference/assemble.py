@@ -11,7 +11,16 @@ from jaxtyping import PRNGKeyArray
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.noise import NoiseModel
-from simpel_cli.inference.protocols import Bank, Normaliser, Problem, Setting, pad_rows, padded_length
+from simpel_cli.inference.protocols import (
+    Bank,
+    Normaliser,
+    Problem,
+    Setting,
+    Training,
+    multiplied,
+    pad_rows,
+    padded_length,
+)
 from simpel_cli.inference.scales import Chooser, chosen
 from simpel_cli.inference.system import System
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
@@ -31,7 +40,7 @@ def assemble(
     normaliser: Normaliser,
     prior: SimulatorPrior | GPPrior,
     score: object,
-    training: list[tuple[np.ndarray, np.ndarray]],
+    training: list[Training],
     noise_std: Mapping[str, float],
     declared_noise: Mapping[str, float],
     *,
@@ -49,7 +58,7 @@ def assemble(
         normaliser: of the system.
         prior: prior declaration.
         score: score estimator.
-        training: inputs (m, dx) and targets (m, dy) in data units, one pair per seed, all of one length.
+        training: rows with targets in data units, one set per seed, all of one length.
         noise_std: measurement noise per state and output, in its unit, declared or estimated.
         declared_noise: what of it was declared, and so is no upper bound.
         noise: of the likelihood.
@@ -66,14 +75,14 @@ def assemble(
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
     declared = encoding.per_target(declared_noise, 0.0) / normaliser.y_std
     noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma, declared))
-    targets = [(y - normaliser.y_mean) / normaliser.y_std for _, y in training]
+    rows = [own._replace(y=(own.y - normaliser.y_mean) / normaliser.y_std) for own in training]
     split = [jax.random.split(key) for key in keys]
     chooser = Chooser(prior, bound, system, normaliser, noise, noise_init)
-    rows = [(x, y) for (x, _), y in zip(training, targets, strict=True)]
     choices, gain = chosen(chooser, rows, [key for key, _ in split], law, kept_law)
     problems = []
-    for (x, y), (_, key), own in zip(rows, split, choices, strict=True):
+    for (x, y, relative, tells), (_, key), own in zip(rows, split, choices, strict=True):
         m, length = len(x), padded_length(max(len(x), 1))
+        weights = multiplied(None if own.law is None else own.law.weights, relative)
         if m == 0:  # what pads must be simulable
             x, y = np.asarray(normaliser.x_mean)[None], np.zeros((1, encoding.dim_y))
         floors = own.noise if m <= chooser.most_rows else np.zeros_like(own.noise)
@@ -87,7 +96,9 @@ def assemble(
             noise_floor=np.asarray(noise.raised(noise_floor, noise.marginal_share * floors, noise_init)),
             bank=_bank(prior, system, pad_rows(x, length), pool, key),
             tail=None if own.law is None else own.law.tail,
-            weights=None if own.law is None else pad_rows(own.law.weights, length),
+            weights=None if weights is None else pad_rows(weights, length),
+            precision=None if relative is None else pad_rows(relative, length),
+            tells=None if tells is None else pad_rows(tells, length),
         )
         problems.append(arrays)
 

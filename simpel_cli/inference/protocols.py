@@ -6,6 +6,7 @@ A posterior = a functional prior x a score estimator x an inference rule. The ru
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -46,7 +47,9 @@ class Problem(NamedTuple):
 
     Training arrays are padded to a common length; only the first `m` rows count. Inputs `x` are in data units,
     targets `y`, `gap_scale`, `noise_init` and `noise_floor` in normalised output units. Where the noise is Student's t, `tail`
-    is 1/nu and `weights` the expected weight of every row, for rules in closed form; None: it is Gaussian.
+    is 1/nu; None: it is Gaussian. `precision` is how much every target counts: its noise has the variance sigma^2/precision, or
+    None: all count alike; where `tells` is 0, the target says nothing of sigma (it was estimated, or lies at a sensor's end).
+    `weights` is what a rule in closed form takes of both, precision times expected weight under Student's t; None: 1.
     """
 
     x: Float[Numbers, "m_padded dx"]
@@ -59,11 +62,77 @@ class Problem(NamedTuple):
     bank: Bank | None = None
     tail: Float[Numbers, " dy"] | None = None
     weights: Float[Numbers, "m_padded dy"] | None = None
+    precision: Float[Numbers, "m_padded dy"] | None = None
+    tells: Float[Numbers, "m_padded dy"] | None = None
+
+    def counted(self, rows: Int[Array, " b"] | None = None) -> "Counted | None":
+        """Return how much targets count; rows: which of them, None: all; None: all count alike."""
+        if self.precision is None or self.tells is None:
+            return None
+        found = jnp.asarray(self.precision), jnp.asarray(self.tells)
+        return Counted(*(a if rows is None else a[rows] for a in found))
 
     @property
     def tails(self) -> Float[Array, " dy"] | None:
         """1/nu of Student's t noise as an array of the program; None: the noise is Gaussian."""
         return None if self.tail is None else jnp.asarray(self.tail)
+
+
+class Training(NamedTuple):
+    """Training transitions of one seed.
+
+    Args:
+        x: inputs, (m, dx).
+        y: targets, (m, dy).
+        precision: how much each target counts, its noise has the variance sigma^2/precision, (m, dy); None: all alike.
+        tells: 0 where a target says nothing of sigma, else 1, (m, dy); None: 1.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    precision: np.ndarray | None = None
+    tells: np.ndarray | None = None
+
+    def take(self, rows: np.ndarray) -> "Training":
+        """Return some of the rows."""
+        return Training(*(None if a is None else a[rows] for a in self))  # type: ignore[arg-type]
+
+
+def multiplied(one: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
+    """Return the product of two weights, of which None is 1."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one * other
+
+
+class Counted(NamedTuple):
+    """How much targets count, and whether they tell of the noise (`Problem`), (n, dy) each."""
+
+    precision: Float[Array, "n dy"]
+    tells: Float[Array, "n dy"]
+
+    def misfit(
+        self,
+        error: Float[Array, "*L n dy"],
+        sigma: Float[Array, " dy"],
+        law: Callable[[Float[Array, "*L n dy"]], Float[Array, "*L n dy"]],
+    ) -> Float[Array, "*L n dy"]:
+        """Return minus the log density of every target, up to a constant.
+
+        Where a target does not tell of sigma, sigma is taken as known.
+
+        Args:
+            error: measured minus predicted.
+            sigma: scale of the noise.
+            law: minus the log density of a standardised error, without the scale's logarithm.
+        """
+        known = jnp.where(self.tells > 0, sigma[None], jax.lax.stop_gradient(sigma)[None])
+        # of every particle alike
+        lead = (1,) * (error.ndim - 2)
+        root, learned = (
+            a.reshape(*lead, *a.shape) for a in (jnp.sqrt(self.precision) / known, jnp.log(sigma)[None] * self.tells)
+        )
+        return law(error * root) + learned
 
 
 @runtime_checkable

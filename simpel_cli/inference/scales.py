@@ -9,7 +9,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.noise import NoiseModel
-from simpel_cli.inference.protocols import Normaliser
+from simpel_cli.inference.protocols import Normaliser, Training, multiplied
 from simpel_cli.inference.system import System
 from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales
@@ -71,13 +71,15 @@ class Chooser(NamedTuple):
         other = self.bound._replace(white_variance=0.0, input_scale=np.asarray(self.bound.input_scale) / longer)
         return other.covariance(jnp.asarray(normalised), jnp.ones(self.system.encoding.dim_y))
 
-    def moments(self, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray) -> Moments:
-        """Return the prior at rows: inputs (m, dx), normalised targets (m, dy)."""
+    def moments(self, training: Training, key: PRNGKeyArray) -> Moments:
+        """Return the prior at training rows with normalised targets."""
+        x, targets = training.x, training.y
         samples = np.zeros((2, *targets.shape))
         if self.prior.uses_simulator:
             drawn = self.system.simulate(key, x, SCALE_DRAWS)
             samples = (drawn - self.normaliser.y_mean) / self.normaliser.y_std
-        return Moments(samples, np.asarray(self.correlation(x)[0]), targets, self.prior.white_variance)
+        white = self.prior.white_variance
+        return Moments(samples, np.asarray(self.correlation(x)[0]), targets, white, training.precision, training.tells)
 
 
 class Chosen(NamedTuple):
@@ -113,7 +115,7 @@ class Looked(NamedTuple):
 
 def chosen(
     chooser: Chooser,
-    training: list[tuple[np.ndarray, np.ndarray]],
+    training: list[Training],
     keys: list[PRNGKeyArray],
     law: str,
     kept: str | None = None,
@@ -122,7 +124,7 @@ def chosen(
 
     Args:
         chooser: prior and system.
-        training: inputs (m, dx) and normalised targets (m, dy) of every seed.
+        training: rows of every seed, with normalised targets.
         keys: one per seed.
         law: of the noise: gaussian, student_t, or auto: what the data say.
         kept: what `auto` once came to, of a run that began: another machine's rounding does not decide again.
@@ -135,20 +137,18 @@ def chosen(
             "data.noise.law: student_t, but its degrees of freedom and scale are learned, and method.noise.learn=false keeps "
             "the noise as it is declared. Set method.noise.learn=true, or data.noise.law=gaussian."
         )
-    looked = [_looked(chooser, x, y, key, law) for (x, y), key in zip(training, keys, strict=True)]
+    looked = [_looked(chooser, rows, key, law) for rows, key in zip(training, keys, strict=True)]
     gain = np.mean([one.gain for one in looked], axis=0).max()
     heavy = gain > LEAST_GAIN if kept is None else kept == "student_t"
     if law == "gaussian" or looked[0].moments is None or (law == "auto" and not heavy):
         return [Chosen(one.gap, one.noise, None) for one in looked], float(gain)
-    return [_heavy(chooser, one, x, y, key) for one, (x, y), key in zip(looked, training, keys, strict=True)], float(
-        gain
-    )
+    return [_heavy(chooser, *each) for each in zip(looked, training, keys, strict=True)], float(gain)
 
 
-def _looked(chooser: Chooser, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray, law: str) -> Looked:
+def _looked(chooser: Chooser, training: Training, key: PRNGKeyArray, law: str) -> Looked:
     """Kappa is what the prior declares; what it does not is chosen by marginal likelihood, as sigma is."""
     size, noise, given = chooser.system.encoding.dim_y, chooser.noise, chooser.given
-    unknown = np.full(len(TAILS), np.nan)
+    unknown, x = np.full(len(TAILS), np.nan), training.x
     # of more rows than are looked at networks learn the noise better than those tell it
     with_noise = noise.learn and noise.marginal_share > 0 and 0 < len(x) <= chooser.most_rows
     with_law = law != "gaussian" and noise.learn and (len(x) >= LEAST_ROWS or law == "student_t")
@@ -160,14 +160,13 @@ def _looked(chooser: Chooser, x: np.ndarray, targets: np.ndarray, key: PRNGKeyAr
     if len(x) > chooser.most_rows:  # the first ones may all be of one episode
         key, key_rows = jax.random.split(key)
         rows = np.asarray(jax.random.choice(key_rows, len(x), (chooser.most_rows,), replace=False))
-    moments = chooser.moments(x[rows], targets[rows], key)
+    moments = chooser.moments(training.take(rows), key)
     found = [
         marginal_likelihood_scales(
-            moments.samples[:, :, i], moments.correlation, moments.targets[:, i], chooser.noise_init[i], moments.white,
-            None if np.isnan(given[i]) else float(given[i]),
+            *moments.whitened(i), chooser.noise_init[i], moments.white, None if np.isnan(given[i]) else float(given[i])
         )
         for i in range(size)
-    ]  # fmt: skip
+    ]
     scale, sigma = (np.array(values) for values in zip(*found, strict=True))
     gain = gain_of_tails(moments, scale, sigma) if with_law else unknown
     if with_noise:
@@ -176,28 +175,28 @@ def _looked(chooser: Chooser, x: np.ndarray, targets: np.ndarray, key: PRNGKeyAr
 
 
 def _smooth(
-    chooser: Chooser, x: np.ndarray, moments: Moments, sigma: np.ndarray, weights: np.ndarray | None = None
+    chooser: Chooser, x: np.ndarray, moments: Moments, sigma: np.ndarray, law: np.ndarray | None = None
 ) -> np.ndarray:
     """Return a noise that is no less than what a smooth function leaves, where there is no simulator."""
     if chooser.prior.uses_simulator:
         return sigma
     left = noise_of_smooth(
         lambda longer: chooser.correlation(x, longer)[0], moments.targets, np.array(len(x), np.int32), moments.white, 1.0,
-        np.full(len(sigma), 1e-3), chooser.noise_init, weights,
+        np.full(len(sigma), 1e-3), chooser.noise_init, multiplied(law, moments.precision), moments.tells,
     )  # fmt: skip
     return np.maximum(sigma, np.asarray(left))
 
 
-def _heavy(chooser: Chooser, looked: Looked, x: np.ndarray, targets: np.ndarray, key: PRNGKeyArray) -> Chosen:
+def _heavy(chooser: Chooser, looked: Looked, training: Training, key: PRNGKeyArray) -> Chosen:
     """Return the choice for noise that is Student's t."""
     assert looked.moments is not None
     assert looked.rows is not None
     law = student_t(looked.moments, looked.gap, looked.noise, chooser.noise_init, given=chooser.given)
-    scale = _smooth(chooser, x[looked.rows], looked.moments, law.scale, law.weights)
-    weights = np.ones(targets.shape)
+    scale = _smooth(chooser, training.x[looked.rows], looked.moments, law.scale, law.weights)
+    weights = np.ones(training.y.shape)
     weights[looked.rows] = law.weights
-    rest = np.setdiff1d(np.arange(len(x)), looked.rows)
+    rest = np.setdiff1d(np.arange(len(training.x)), looked.rows)
     for k, rows in enumerate(np.array_split(rest, -(-len(rest) // chooser.most_rows)) if len(rest) else []):
-        moments = chooser.moments(x[rows], targets[rows], jax.random.fold_in(key, k))
+        moments = chooser.moments(training.take(rows), jax.random.fold_in(key, k))
         weights[rows] = weights_of(law, moments)
     return Chosen(law.gap, scale, law._replace(weights=weights, scale=scale))

@@ -75,7 +75,7 @@ class ExactGP:
             raise ConfigError("method: gp needs the gap process of prior=simulator; prior=simulator_only has none.")
         kernel, scale, dtype = prior.kernel, problem.normaliser, problem.x.dtype
         # noise with heavy tails holds the white model error, too (`priors.noise_law`)
-        white = prior.white_variance if problem.weights is None else 0.0
+        white = prior.white_variance if problem.tail is None else 0.0
         counts = (jnp.arange(problem.x.shape[0], dtype=jnp.int32) < problem.m).astype(jnp.float64)
         kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
 
@@ -89,9 +89,13 @@ class ExactGP:
             phi = identified(self.sysid, setting, problem, key)
             known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
-            data = weighted_spectra(gram(kernel, known, known), left, problem.m, problem.weights)
+            correlation = gram(kernel, known, known)
+            data = weighted_spectra(correlation, left, problem.m, problem.weights)
+            telling = data
+            if problem.tells is not None:
+                telling = weighted_spectra(correlation, left, problem.m, problem.weights, problem.tells)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = best_scales(data, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
+            best = best_scales(telling, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
                 data,

@@ -26,7 +26,7 @@ from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.inference import student_t
 from simpel_cli.inference.networks import MLP
 from simpel_cli.inference.noise import NoiseModel, Numbers
-from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
+from simpel_cli.inference.protocols import Counted, Inference, Info, Problem, Setting
 from simpel_cli.methods.particle_networks import Networks, State, refuse_rates
 from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
 from simpel_cli.scores.estimator import Score, fitted
@@ -185,7 +185,10 @@ class FunctionSpace(ABC):
 
             weight = problem.m.astype(dtype) / at_least_one(counted)
             fit, (score_data, score_noise) = jax.value_and_grad(
-                lambda h, rho: log_likelihood(h, networks.noise_scale(rho), y, counted, problem.tails), argnums=(0, 1)
+                lambda h, rho: log_likelihood(
+                    h, networks.noise_scale(rho), y, counted, problem.tails, problem.counted(batch)
+                ),
+                argnums=(0, 1),
             )(h[:, :b], state.noise)
             prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(scores, h)
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
@@ -235,6 +238,7 @@ def log_likelihood(
     y: Float[Array, "b dy"],
     counted: Float[Array, " b"],
     tail: Float[Numbers, " dy"] | None = None,
+    rows: Counted | None = None,
 ) -> Float[Array, ""]:
     """Return the sum over particles, counted points and outputs of the log density of the noise, up to a constant.
 
@@ -244,7 +248,14 @@ def log_likelihood(
         y: measured targets.
         counted: 1 for data, 0 for what fills the batch.
         tail: of Student's t, which keeps a row that is far off from dragging a sharp posterior; None: Gaussian.
+        rows: how much each target counts; None: all count alike.
     """
-    z = (y[None] - h) / sigma[None, None]
-    law = -0.5 * z * z if tail is None else student_t.log_density(z, jnp.asarray(tail)[None, None])
-    return jnp.sum((law - jnp.log(sigma)[None, None]) * counted[None, :, None])
+
+    def law(z: Float[Array, "L b dy"]) -> Float[Array, "L b dy"]:
+        return 0.5 * z * z if tail is None else -student_t.log_density(z, jnp.asarray(tail)[None, None])
+
+    if rows is None:
+        misfit = law((y[None] - h) / sigma[None, None]) + jnp.log(sigma)[None, None]
+    else:
+        misfit = rows.misfit(y[None] - h, sigma, law)
+    return -jnp.sum(misfit * counted[None, :, None])

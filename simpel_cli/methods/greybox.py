@@ -124,11 +124,13 @@ class GreyBox:
 
             prior_std = noise.prior_std if noise.learn else None
             weights = None if problem.weights is None else jnp.asarray(problem.weights)[rows]
-            best = best_scales(weighted_spectra(correlation(1.0), y, m, weights), kappa, 0.0, prior_std, floor, init)
+            tells = None if problem.tells is None else jnp.asarray(problem.tells)[rows]
+            spectra = weighted_spectra(correlation(1.0), y, m, weights, tells)
+            best = best_scales(spectra, kappa, 0.0, prior_std, floor, init)
             if not floors:
                 return best.scale.astype(dtype), jnp.asarray(floor)
             sigma = jnp.maximum(
-                best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init, weights)
+                best.noise, noise_of_smooth(correlation, y, m, 0.0, noise.prior_std, floor, init, weights, tells)
             )
             least = noise.raised(floor, noise.marginal_share * sigma.astype(dtype), init)
             return best.scale.astype(dtype), jnp.asarray(least)

@@ -124,9 +124,11 @@ class Pathwise:
         counts = (jnp.arange(len(rows), dtype=jnp.int32) < count).astype(jnp.float64)
         known = scale.x(jnp.asarray(problem.x)[rows])
         weights, white = jnp.ones((len(rows), dim_y), jnp.float64), prior.white_variance
-        if problem.weights is not None:  # Student's t noise: a Gaussian whose variance differs from row to row
-            white = 0.0  # it holds the white model error (`priors.noise_law`)
+        if problem.tail is not None:
+            white = 0.0  # Student's t holds the white model error (`priors.noise_law`)
+        if problem.weights is not None:  # a Gaussian whose variance differs from row to row
             weights = jnp.asarray(problem.weights)[rows].astype(jnp.float64)
+        tells = jnp.ones_like(weights) if problem.tells is None else jnp.asarray(problem.tells)[rows]
 
         def simulated(key: PRNGKeyArray, x: Float[Numbers, "n dx"], at: Int[Array, " n"]) -> Float[Array, "n dy N"]:
             """Draws at inputs in data units, which are these rows of a bank, normalised; those of the paths first."""
@@ -182,18 +184,21 @@ class Pathwise:
                 ],
             ) -> Float[Array, ""]:
                 own, left, kappa, floor, typical, root = given
-                real, left = root * counts[few], root * left  # rows count by their weights
+                # rows count by their weights; those that tell nothing of the noise are left out, as padding is
+                real, left = root * counts[few], root * left
                 law = (own @ own.T + kappa**2 * correlation) * real[:, None] * real[None]
                 values, vectors = jnp.linalg.eigh(law)
                 turned = vectors.T @ (left * counts[few])[:, None]
-                spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, len(real) - jnp.sum(counts[few]))
+                silent = jnp.sum(jnp.where(real > 0, 0.0, 1.0))
+                spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, silent)
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
                 return best_scales(spectrum, one, white, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(
-                of_output, (draws[:, few], left.T, kappa, floor, typical, jnp.sqrt(weights[few]).T)
+                of_output,
+                (draws[:, few], left.T, kappa, floor, typical, (jnp.sqrt(weights) * tells.astype(jnp.float64))[few].T),
             )
             return found
 

@@ -77,9 +77,8 @@ class SVGD:
             weight = problem.m.astype(dtype) / at_least_one(counted)
 
             def fit(particles: Particles, rho: Float[Array, " dy"]) -> Float[Array, ""]:
-                return log_likelihood(
-                    self.network.apply_all(particles, x), networks.noise_scale(rho), y, counted, problem.tails
-                )
+                h, sigma = self.network.apply_all(particles, x), networks.noise_scale(rho)
+                return log_likelihood(h, sigma, y, counted, problem.tails, problem.counted(batch))
 
             value, (slope, slope_noise) = jax.value_and_grad(fit, argnums=(0, 1))(state.particles, state.noise)
             prior = jax.grad(lambda p: self.log_prior(p))(state.particles)

@@ -91,9 +91,16 @@ class SysID:
 
         def judged(f: Float[Array, "n dy"], u: Float[Array, " dp"], rho: Float[Array, " dy"]) -> Float[Array, ""]:
             """Return the loss of simulated targets f."""
-            e = (jnp.asarray(problem.y) - f) / sigma(rho)[None]
-            misfit = 0.5 * e**2 if problem.tails is None else -student_t.log_density(e, problem.tails[None])
-            data = jnp.sum(counts * (misfit + jnp.log(sigma(rho))[None]))
+
+            def law(z: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+                return 0.5 * z**2 if problem.tails is None else -student_t.log_density(z, problem.tails[None])
+
+            e, rows = jnp.asarray(problem.y) - f, problem.counted()
+            if rows is None:
+                misfit = law(e / sigma(rho)[None]) + jnp.log(sigma(rho))[None]
+            else:
+                misfit = rows.misfit(e, sigma(rho), law)
+            data = jnp.sum(counts * misfit)
             learned = self.noise.log_prior(rho, problem.noise_init, problem.noise_floor) if self.noise.learn else 0.0
             return data + 0.5 * jnp.sum(jnp.where(gaussian, u**2, 0.0)) - learned
 
@@ -111,8 +118,14 @@ class SysID:
             if problem.tails is not None:
                 of_location, of_scale = student_t.information(problem.tails)
                 slope = slope * jnp.sqrt(of_location)[None, :, None]
-            of_u = jnp.einsum("nki,nkj->ij", slope * counts[:, :, None], slope) + jnp.diag(gaussian.astype(dtype))
-            of_log = of_scale * problem.m.astype(dtype) + 1 / self.noise.prior_std**2
+            rows = problem.counted()
+            location, scales = (
+                (counts, problem.m.astype(dtype))
+                if rows is None
+                else (counts * rows.precision, jnp.sum(counts * rows.tells, axis=0))
+            )
+            of_u = jnp.einsum("nki,nkj->ij", slope * location[:, :, None], slope) + jnp.diag(gaussian.astype(dtype))
+            of_log = of_scale * scales + 1 / self.noise.prior_std**2
             bend = jax.nn.sigmoid(rho) / sigma(rho)  # d log sigma / d rho
             return jax.scipy.linalg.block_diag(of_u, jnp.diag(of_log * bend**2))
 

@@ -76,17 +76,24 @@ def weighted_spectra(
     residual: Float[Array, "m dy"],
     rows: Int[Numbers, ""],
     weights: Float[Numbers, "m dy"] | None,
+    tells: Float[Numbers, "m dy"] | None = None,
 ) -> Spectrum:
     """Return the spectrum of rows that count by their weights, one per output, leading axis dy; None: all alike, one for all.
 
-    Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I).
+    Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I). Where
+    `tells` is 0 a row is left out, as padding is.
     """
     if weights is None:
         return spectrum(correlation, residual, rows)
     root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
+    if tells is not None:
+        root = root * jnp.asarray(tells).astype(jnp.float64).T
+    real = (jnp.arange(len(residual), dtype=jnp.int32) < rows).astype(jnp.float64)
 
     def of_output(root: Float[Array, " m"], left: Float[Array, " m"]) -> Spectrum:
-        return spectrum(correlation * root[:, None] * root[None], (left * root)[:, None], rows)
+        found = spectrum(correlation * root[:, None] * root[None], (left * root)[:, None], rows)
+        silent = jnp.sum(jnp.where(root > 0, 0.0, real))
+        return found._replace(padding=found.padding + silent)
 
     found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T))
     return found
@@ -156,6 +163,7 @@ def noise_of_smooth(
     floor: Float[Numbers, " dy"],
     typical: Float[Numbers, " dy"],
     weights: Float[Numbers, "m dy"] | None = None,
+    tells: Float[Numbers, "m dy"] | None = None,
 ) -> Float[Array, " dy"]:
     """Return what a smooth function leaves of the residuals, where neither its size nor its lengthscale is known.
 
@@ -171,10 +179,13 @@ def noise_of_smooth(
         floor: smallest noise.
         typical: its typical value.
         weights: of the rows; see `weighted_spectra`.
+        tells: of the rows, too.
     """
     left = jnp.asarray(residual)
     found = [
-        best_scales(weighted_spectra(correlation(f), left, rows, weights), None, white, prior_std, floor, typical)
+        best_scales(
+            weighted_spectra(correlation(f), left, rows, weights, tells), None, white, prior_std, floor, typical
+        )
         for f in LONGER
     ]
     noise, loss = (jnp.stack(values) for values in ([f.noise for f in found], [f.loss for f in found]))

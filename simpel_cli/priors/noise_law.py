@@ -26,6 +26,7 @@ SCALES = np.geomspace(0.2, 2.0, 47)  # of the errors' standard deviations
 SPREAD = 0.1  # of an output's tail about the common one
 LEAST_GAIN = 3.0  # nats that Student's t has to be ahead by
 LEAST_ROWS = 20  # fewer tell nothing of a tail
+FEWEST = 5  # rows that tell of an output's noise; of fewer, all are asked
 ROUNDS = 8
 
 
@@ -53,18 +54,37 @@ class Moments(NamedTuple):
         correlation: of the gap, (m, m).
         targets: measured, (m, dy).
         white: white model error of the prior, a variance.
+        precision: how much each target counts, its noise has the variance sigma^2/precision, (m, dy); None: all alike.
+        tells: whether it tells of the noise, (m, dy); None: every one does.
     """
 
     samples: np.ndarray
     correlation: np.ndarray
     targets: np.ndarray
     white: float
+    precision: np.ndarray | None = None
+    tells: np.ndarray | None = None
+
+    def rows(self, i: int) -> np.ndarray:
+        """Return the rows that tell of an output's noise; of too few, all of them."""
+        every = np.arange(len(self.targets))
+        if self.tells is None:
+            return every
+        found = np.flatnonzero(self.tells[:, i] > 0)
+        return found if len(found) >= FEWEST else every
+
+    def whitened(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return samples (N, m'), correlation (m', m') and targets (m',) of `rows`, in units in which all count alike."""
+        rows = self.rows(i)
+        root = np.ones(len(rows)) if self.precision is None else np.sqrt(self.precision[rows, i])
+        correlation = self.correlation[np.ix_(rows, rows)] * np.outer(root, root)
+        return self.samples[:, rows, i] * root[None], correlation, self.targets[rows, i] * root
 
     def of_output(self, i: int, kappa: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return covariance of the function, (m, m), and residual, (m,)."""
-        covariance = np.atleast_2d(np.cov(self.samples[:, :, i], rowvar=False))
-        covariance = covariance + kappa**2 * self.correlation
-        return covariance, self.targets[:, i] - self.samples[:, :, i].mean(axis=0)
+        """Return covariance of the function, (m', m'), and residual, (m',), in units in which all targets count alike."""
+        samples, correlation, targets = self.whitened(i)
+        covariance = np.atleast_2d(np.cov(samples, rowvar=False))
+        return covariance + kappa**2 * correlation, targets - samples.mean(axis=0)
 
 
 class LeftOut(NamedTuple):
@@ -138,22 +158,25 @@ def student_t(
     m, size = moments.targets.shape
     kappa, sigma = kappa.copy(), np.sqrt(sigma**2 + moments.white)
     weights, tail = np.ones((m, size)), np.full(size, 0.25)
+    rows = [moments.rows(i) for i in range(size)]
+    told = np.stack([np.isin(np.arange(m), own) for own in rows], axis=1)
+    count = told.sum(axis=0)
     for turn in range(ROUNDS):
         scores = np.zeros((size, len(TAILS)))
         squared = np.zeros((m, size))
         for i in range(size):
             if turn and np.isnan(given[i]) and turn % 3 == 1:
-                kappa[i], own = _weighted_scales(moments, i, weights[:, i], noise_init[i])
+                kappa[i], own = _weighted_scales(moments, i, weights[rows[i], i], noise_init[i])
                 sigma[i] = np.sqrt(own**2 + moments.white)
             covariance, residual = moments.of_output(i, kappa[i])
-            found = left_out(covariance, residual, sigma[i] ** 2 / weights[:, i])
+            found = left_out(covariance, residual, sigma[i] ** 2 / weights[rows[i], i])
             scores[i] = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))[0][1:]
-            squared[:, i] = found.squared
+            squared[rows[i], i] = found.squared
         tail = _tails(scores)
-        weights = (1 + tail) / (1 + tail * squared / sigma**2)
+        weights = np.where(told, (1 + tail) / (1 + tail * squared / sigma**2), 1.0)
         # M-step of the scale with its prior, log sigma ~ N(log noise_init, 1), which decides where there are few rows
-        data = np.sum(weights * squared, axis=0) / m
-        sigma = np.exp((m * np.log(data) / 2 + np.log(noise_init) / 2) / (m + 0.5))
+        data = np.sum(weights * squared * told, axis=0) / count
+        sigma = np.exp((count * np.log(data) / 2 + np.log(noise_init) / 2) / (count + 0.5))
     return Law(tail, weights, kappa, sigma)
 
 
@@ -164,8 +187,9 @@ def weights_of(law: Law, moments: Moments) -> np.ndarray:
     for _ in range(ROUNDS):
         for i in range(size):
             covariance, residual = moments.of_output(i, law.gap[i])
-            found = left_out(covariance, residual, law.scale[i] ** 2 / weights[:, i])
-            weights[:, i] = (1 + law.tail[i]) / (1 + law.tail[i] * found.squared / law.scale[i] ** 2)
+            rows = moments.rows(i)
+            found = left_out(covariance, residual, law.scale[i] ** 2 / weights[rows, i])
+            weights[rows, i] = (1 + law.tail[i]) / (1 + law.tail[i] * found.squared / law.scale[i] ** 2)
     return weights
 
 
@@ -181,9 +205,8 @@ def _tails(scores: np.ndarray) -> np.ndarray:
 
 def _weighted_scales(moments: Moments, i: int, weights: np.ndarray, noise_init: float) -> tuple[float, float]:
     """Return kappa and sigma of the largest marginal likelihood with rows that count by their weights."""
-    root = np.sqrt(weights)
+    root, (samples, correlation, targets) = np.sqrt(weights), moments.whitened(i)
     scales = marginal_likelihood_scales(
-        moments.samples[:, :, i] * root[None], moments.correlation * np.outer(root, root), moments.targets[:, i] * root,
-        noise_init, moments.white,
-    )  # fmt: skip
+        samples * root[None], correlation * np.outer(root, root), targets * root, noise_init, moments.white
+    )
     return scales.gap, scales.noise

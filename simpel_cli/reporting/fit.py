@@ -47,7 +47,7 @@ def describe(terminal: Terminal, study: Study, fitted: Fitted, checked: PriorChe
         f"simpel fit · {s.name} · {named_method(study)} · {seeds} · {study.device.platform} {s.precision}",
         style="bold",
     )
-    rows = len(fitted.training[0][0])
+    rows = len(fitted.training[0].x)
     describe_data(terminal, recording, f"{split_summary(recording)}, {used(study.method, source, rows)}")
     uncertain = " ".join(q.name for q in source.params) or "nothing"
     kind = "" if study.system.transition is not None else " (black box)"

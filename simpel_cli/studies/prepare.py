@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from simpel_cli.data import no_transitions, select, transitions
+from simpel_cli.data import Transitions, no_transitions, select, transitions
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference.assemble import Assembled, assemble
-from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting
+from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting, Training
 from simpel_cli.inference.system import normaliser_of
 from simpel_cli.runs.settings import stream
 from simpel_cli.studies.open import Study
@@ -25,14 +26,14 @@ class Fitted(NamedTuple):
     assembled: Assembled
     bind: Callable[[Problem], Inference]
     keys: Key[Array, " seeds"]
-    training: list[tuple[np.ndarray, np.ndarray]]
+    training: list[Training]
     available: int  # training transitions that `data.n_train` chose from
     normaliser: Normaliser
 
     @property
     def n_train(self) -> int:
         """Number of training transitions."""
-        return len(self.training[0][0])
+        return len(self.training[0].x)
 
     @property
     def target_std(self) -> np.ndarray:
@@ -53,8 +54,11 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
     carried = (encoding.stack, encoding.linear)
     outputs = len(study.recording.outputs)
     pairs = transitions(recorded, *carried) if recorded else no_transitions(source, outputs, *carried)
+    alike = bool((pairs.weight == 1).all())
     training = [
-        test_arrays(select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), encoding)
+        training_arrays(
+            select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), encoding, alike=alike
+        )
         for seed in settings.all_seeds
     ]
     # one normaliser for all seeds and all n_train: results stay comparable
@@ -76,6 +80,22 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
     )
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
     return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
+
+
+def training_arrays(pairs: Transitions, encoding: Encoding, *, alike: bool) -> Training:
+    """Return network inputs and targets in data units; a change that was estimated counts as far as it is known.
+
+    Args:
+        pairs: training transitions.
+        encoding: coordinates.
+        alike: whether all targets count alike.
+    """
+    x, y = test_arrays(pairs, encoding)
+    if alike:
+        return Training(x, y)
+    weight = pairs.weight[:, encoding.quantity_of_target]
+    # what was estimated by the simulator agrees with it: it tells nothing of the noise
+    return Training(x, y, weight, (weight == 1).astype(float))
 
 
 def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:

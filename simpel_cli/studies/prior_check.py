@@ -11,10 +11,10 @@ from simpel_cli.studies.prepare import Fitted
 
 def prior_check(study: Study, fitted: Fitted) -> PriorCheck | None:
     """Compare the training targets of the first seed with draws of the prior; None where there is nothing to compare."""
-    if not study.prior.uses_simulator or len(fitted.training[0][0]) == 0:
+    if not study.prior.uses_simulator or len(fitted.training[0].x) == 0:
         return None
     problem = jax.tree.map(lambda a: np.asarray(a[0]), fitted.assembled.problems)
-    x, y = fitted.training[0]
+    x, y = fitted.training[0][:2]
     gap_scale = None if study.prior.gap is None else problem.gap_scale
     return check_prior(
         study.system, fitted.assembled.setting, fitted.normaliser, x, y, study.recording.noise_std, gap_scale,

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir, recordings_dir
 from simpel_cli.inference.assemble import Assembled, assemble
-from simpel_cli.inference.protocols import Method, Normaliser
+from simpel_cli.inference.protocols import Method, Normaliser, Training
 from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import stream
@@ -134,7 +134,7 @@ def case(
         chosen = np.random.default_rng(0).integers(0, len(x), rows)
         x, y = x[chosen], y[chosen]
     assembled = assemble(
-        system, normaliser, prior_of(method, scale, draws), build(node("score", score), "score"), [(x, y)] * seeds,
+        system, normaliser, prior_of(method, scale, draws), build(node("score", score), "score"), [Training(x, y)] * seeds,
         NOISE[kind], NOISE[kind] if kind == "pendulum" else {}, noise=rule.noise, pool=rule.pool,
         keys=[stream(s, "prior") for s in range(seeds)], precision="float32", law=law,
     )  # fmt: skip

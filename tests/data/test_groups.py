@@ -17,6 +17,7 @@ from simpel_cli.evaluation import test_arrays as arrays_of
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
 from simpel_cli.inference.assemble import assemble
+from simpel_cli.inference.protocols import Training
 from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.methods.sysid import SysID, identified
 from simpel_cli.priors.function_prior import SimulatorPrior
@@ -165,7 +166,8 @@ def test_an_identified_simulator_knows_every_group(made) -> None:
         normaliser = normaliser_of(system, jax.random.key(0))
         method = SysID(starts=4)
         done = assemble(
-            system, normaliser, SimulatorPrior(gap=None), Gaussian(), [(x, y)], data.noise_std, {}, noise=method.noise, pool=1,
+            system, normaliser, SimulatorPrior(gap=None), Gaussian(), [Training(x, y)], data.noise_std, {},
+            noise=method.noise, pool=1,
             keys=[jax.random.key(1)], precision="float64", law="gaussian",
         )  # fmt: skip
         problem = jax.tree.map(lambda a: a[0], done.problems)

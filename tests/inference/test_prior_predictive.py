@@ -9,7 +9,7 @@ import pytest
 from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.prior_predictive import SURPRISING, PriorCheck, check_prior, measurement_noise
-from simpel_cli.inference.protocols import Bank, Normaliser, Setting
+from simpel_cli.inference.protocols import Bank, Normaliser, Setting, Training
 from simpel_cli.inference.system import System, normaliser_of, system_of
 from simpel_cli.priors.function_prior import GapGP, SimulatorPrior
 from simpel_cli.runs.settings import stream
@@ -39,7 +39,7 @@ def bound(gap: bool) -> tuple[System, Normaliser, Setting, np.ndarray | None]:
     normaliser = normaliser_of(system, stream(0, "normaliser"))
     y = np.tanh(x) + 0.3 * x**2
     assembled = assemble(
-        system, normaliser, SimulatorPrior(gap=GapGP() if gap else None), Gaussian(), [(x[:, None], y[:, None])],
+        system, normaliser, SimulatorPrior(gap=GapGP() if gap else None), Gaussian(), [Training(x[:, None], y[:, None])],
         {"f": NOISE}, {"f": NOISE}, noise=NoiseModel(), pool=64, keys=[stream(0, "prior")], precision="float32",
     )  # fmt: skip
     return system, normaliser, assembled.setting, np.asarray(assembled.problems.gap_scale[0]) if gap else None

@@ -11,7 +11,7 @@ from scipy import stats
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.noise import NoiseModel
-from simpel_cli.inference.protocols import padded_length
+from simpel_cli.inference.protocols import Training, padded_length
 from simpel_cli.inference.scales import SCALE_DRAWS, SCALE_POINTS, WORLD_SCALE_POINTS
 from simpel_cli.inference.system import WORLD_POINTS, normaliser_of, system_of  # fmt: skip
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
@@ -51,7 +51,7 @@ def assembled(system, prior, n=6, seeds=1):
     y = exact(states, inputs, np.ones((n, 1))) - states + 0.3 * states**2
     normaliser = normaliser_of(system, KEY)
     return normaliser, assemble(
-        system, normaliser, prior, Gaussian(), [(x, y)] * seeds, {"x": 0.001}, {},
+        system, normaliser, prior, Gaussian(), [Training(x, y)] * seeds, {"x": 0.001}, {},
         noise=NoiseModel(), pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32",
     )  # fmt: skip
 
@@ -175,7 +175,7 @@ def test_training_inputs_at_which_the_simulator_blows_up_are_named_too():
     x = np.array([[0.0, 0.0], [9.0, 1.0], [0.5, -1.0]])
     with pytest.raises(ConfigError, match=r"from state x = 9 m; input u = 1 N; parameters a = .*\(512 of 1536 runs\)"):
         assemble(
-            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [(x, x[:, :1])], {}, {},
+            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [Training(x, x[:, :1])], {}, {},
             noise=NoiseModel(), pool=16, keys=[KEY], precision="float32",
         )  # fmt: skip
 
@@ -194,7 +194,7 @@ def test_the_gap_scale_of_many_rows_looks_at_all_of_them():
 
     def chosen(rows, key):
         return assemble(
-            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [(x[rows], y[rows])], {}, {},
+            system, normaliser, SimulatorPrior(GapGP(scale="auto")), Gaussian(), [Training(x[rows], y[rows])], {}, {},
             noise=NoiseModel(), pool=16, keys=[key], precision="float32",
         ).gap_scale[0]  # fmt: skip
 
@@ -228,7 +228,7 @@ def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
 
     def floor(rows=120, **fields):
         done = assemble(
-            system, normaliser, prior, Gaussian(), [(x[:rows], y[:rows])], {}, {},
+            system, normaliser, prior, Gaussian(), [Training(x[:rows], y[:rows])], {}, {},
             noise=NoiseModel(**fields), pool=16, keys=[KEY], precision="float32",
         )  # fmt: skip
         return float(done.problems.noise_floor[0, 0])

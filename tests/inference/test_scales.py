@@ -8,6 +8,7 @@ from simpel_cli.errors import ConfigError
 from simpel_cli.inference import scales
 from simpel_cli.inference.assemble import Assembled, assemble
 from simpel_cli.inference.noise import NoiseModel
+from simpel_cli.inference.protocols import Training
 from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.priors.function_prior import SimulatorPrior
 from simpel_cli.reporting.run_table import law_in_words
@@ -35,7 +36,7 @@ def assembled(
     y = x[:, :1] * (decay - 1) + x[:, 1:] * (1 - decay) + SIGMA * noise
     y[-1:] += OFF if freedom is not None else 0.0
     return assemble(
-        SYSTEM, normaliser_of(SYSTEM, KEY), SimulatorPrior(), Gaussian(), [(x, y)] * seeds, {"x": SIGMA}, {},
+        SYSTEM, normaliser_of(SYSTEM, KEY), SimulatorPrior(), Gaussian(), [Training(x, y)] * seeds, {"x": SIGMA}, {},
         noise=NoiseModel(learn=learn), pool=16, keys=list(jax.random.split(KEY, seeds)), precision="float32", law=law,
         kept_law=kept,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from simpel_cli.config.folders import conf_dir
 from simpel_cli.inference import loop
 from simpel_cli.inference.assemble import assemble
 from simpel_cli.inference.noise import NoiseModel
-from simpel_cli.inference.protocols import Method, Normaliser, ScoreEstimator
+from simpel_cli.inference.protocols import Method, Normaliser, ScoreEstimator, Training
 from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.files import write_table, write_text
@@ -73,7 +73,7 @@ def fit(
 ) -> Fitted:
     """Fit a rule from several seeds in one program."""
     configure(Settings())
-    pair = (given.x[:, None], given.y[:, None])
+    pair = Training(given.x[:, None], given.y[:, None])
     assembled = assemble(
         given.system, given.normaliser, prior, score, [pair] * seeds, {}, {},
         noise=rule.noise, pool=rule.pool, keys=[stream(s, "prior") for s in range(seeds)], precision="float32",
