@@ -39,7 +39,8 @@ def read(
         seed: of the run; `config.seed` wins.
         whole: every state is needed in every row, so refuse one that is not measured and cannot be estimated; else it
             stays NaN.
-        partial: rows may lack values, and values may be measured before their row (`Episode.late`); None: unless `whole`.
+        partial: rows may lack values, and values may be measured before their row (`Episode.late`); None: unless `whole`. With
+            `whole`, the filter is to estimate what is missing (`filtering.estimated_rows`): rows still have to be dt apart.
 
     Returns:
         Checked episodes, at least one each to train and to test on, unless the data YAML keeps none to test on.
@@ -82,8 +83,9 @@ def read(
     # the filter of `discover` takes a row as it is; brought to another dt it has to be complete
     partial = (not whole if partial is None else partial) and dynamic and config.resample is None
     rows, when = when_measured(
-        config, model, rows, table, mapping, joined, named_episodes(config, table, rows), partial=partial
-    )
+        config, model, rows, table, mapping, joined, named_episodes(config, table, rows), partial=partial,
+        ranges=not whole,
+    )  # fmt: skip
     report += [when] if when is not None else []
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
@@ -122,20 +124,21 @@ def _trajectories(
     config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool, *, partial: bool
 ) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
     """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
-    sampling, raw, longest = clock.sampling(rows, model, config, as_they_are=partial)
+    as_they_are = partial and not whole
+    sampling, raw, longest = clock.sampling(rows, model, config, as_they_are=as_they_are)
     cut, starts = cut_at_gaps(rows, longest, config)
     tagged = _segments(model, rows, starts)
     measured = np.array([q.name in mapping.columns for q in model.states], dtype=bool)
     there = values.complete(rows, measured)
     if there.all():
-        faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw, partial)
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in tagged], raw, as_they_are)
     elif there.sum() > len(there) / 2:  # faults of sensors show in rows that follow each other
         alone = rows.take(there)
         pieces = _segments(model, alone, cut_at_gaps(alone, longest, config)[1])
-        faults, computed = _sensors(config, model, mapping, [episode for _, episode in pieces], raw, partial)
+        faults, computed = _sensors(config, model, mapping, [episode for _, episode in pieces], raw, as_they_are)
     else:
         faults, computed = _sensors(
-            config, model, mapping, [episode for _, episode in tagged], raw, partial, together=False
+            config, model, mapping, [episode for _, episode in tagged], raw, as_they_are, together=False
         )
     report = [sampling, cut, *faults]
     episodes = tuple(episode for part in PARTS for tag, episode in tagged if tag == part)
@@ -167,7 +170,7 @@ def _sensors(
     mapping: Mapping,
     segments: list[Episode],
     dt: float,
-    partial: bool,
+    as_they_are: bool,
     *,
     together: bool = True,
 ) -> tuple[list[Check], tuple[str, ...]]:
@@ -195,7 +198,7 @@ def _sensors(
         if p in columns and v in columns and together
     ]
     found = [
-        sensors.jitter(times, dt, model.dt if config.resample is None else None, as_they_are=partial),
+        sensors.jitter(times, dt, model.dt if config.resample is None else None, as_they_are=as_they_are),
         sensors.stale(columns),
         sensors.quantisation(columns, units),
         kinematics(motions),

@@ -96,6 +96,19 @@ def transitions(episodes: Sequence[Episode], stack_actions: int, linear: Sequenc
     return joined
 
 
+def with_measured_targets(pairs: Transitions, episodes: Sequence[Episode]) -> Transitions:
+    """Return the transitions whose next states and outputs were all measured; of none, all: estimates are all there is."""
+    n_states = pairs.states.shape[1]
+    good = np.ones(len(pairs.row), bool)
+    for index, episode in enumerate(episodes):
+        if episode.weight is None:
+            continue
+        own = pairs.episode == index
+        after, now = episode.weight[pairs.row[own] + (n_states > 0)], episode.weight[pairs.row[own]]
+        good[own] = (after[:, :n_states] == 1).all(axis=1) & (now[:, n_states:] == 1).all(axis=1)
+    return pairs.take(good) if good.any() else pairs
+
+
 def no_transitions(source: Source, outputs: int, stack_actions: int, linear: Sequence[int] = ()) -> Transitions:
     """Return no transition at all, of a simulator with so many measured outputs."""
     width = (stack_actions + 1) * len(source.inputs) + len(linear)

@@ -14,6 +14,10 @@ class Blocks(NamedTuple):
     of_point: np.ndarray  # (n,) block of every point
     kind: str
 
+    def take(self, rows: np.ndarray) -> "Blocks":
+        """Return the blocks of some of the points."""
+        return Blocks(np.unique(self.of_point[rows], return_inverse=True)[1].reshape(-1), self.kind)
+
     def __str__(self) -> str:
         count = len(np.unique(self.of_point))
         return f"{count} {self.kind}" if count > 1 else f"nothing: one of the {self.kind} holds all points"

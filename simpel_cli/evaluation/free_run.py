@@ -6,20 +6,23 @@ import numpy as np
 
 from simpel_cli.data.recording import Episode
 from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
+from simpel_cli.evaluation.bootstrap import Blocks, Estimate, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import Posterior, noise_of
 from simpel_cli.inference.protocols import padded_length
+
+UNKNOWN = Estimate(np.nan, np.nan, np.nan)
 
 
 class FreeRun(NamedTuple):
     """Roll-outs of the posterior along measured inputs, from W windows of test episodes, in physical units."""
 
-    measured: np.ndarray  # (W, H + 1, ds)
+    measured: np.ndarray  # (W, H + 1, ds), estimated where `known` is False
     mean: np.ndarray  # (W, H + 1, ds)
     std: np.ndarray  # (W, H + 1, ds), between particles and with observation noise
     episode: np.ndarray  # (W,)
     row: np.ndarray  # (W,) first row in the episode
     error: np.ndarray  # (W, H + 1, ds), angles wrapped
+    known: np.ndarray  # (W, H + 1, ds), whether the state was measured there
 
 
 def windows(episodes: tuple[Episode, ...], horizon: int, first: int) -> list[tuple[int, int]]:
@@ -58,7 +61,14 @@ def free_run(posterior: Posterior, encoding: Encoding, episodes: tuple[Episode, 
     periodic = np.array([q.periodic for q in encoding.states])
     error = np.where(periodic, (error + np.pi) % (2 * np.pi) - np.pi, error)
     first = np.array(starts)
-    return FreeRun(measured, mean, std, first[:, 0], first[:, 1], error)
+    known = np.stack([_known(episodes[e])[s : s + horizon + 1] for e, s in starts])
+    return FreeRun(measured, mean, std, first[:, 0], first[:, 1], error, known)
+
+
+def _known(episode: Episode) -> np.ndarray:
+    """Return which states were measured, (T, ds)."""
+    ds = episode.states.shape[1]
+    return np.ones(episode.states.shape, bool) if episode.weight is None else episode.weight[:, :ds] == 1
 
 
 def rollout(
@@ -113,11 +123,17 @@ def _stacked(inputs: np.ndarray, start: int, horizon: int, encoding: Encoding) -
 
 
 def free_run_table(run: FreeRun, blocks: Blocks, encoding: Encoding, dt: float) -> list[dict[str, object]]:
-    """Return metric rows `free_run_rmse@<horizon>s` per state at a quarter, half and the whole of the horizon."""
+    """Return metric rows `free_run_rmse@<horizon>s` per state at a quarter, half and the whole of the horizon.
+
+    Where a state was measured at few rows, those runs count whose last row is one of them; of none NaN.
+    """
     horizon = run.error.shape[1] - 1
     rows: list[dict[str, object]] = []
     for h in sorted({max(1, horizon // 4), max(1, horizon // 2), horizon}):
         for i, q in enumerate(encoding.states):
-            estimate = bootstrap(run.error[:, h, i] ** 2, blocks, np.sqrt)
+            there = run.known[:, h, i]
+            estimate = UNKNOWN
+            if there.any():
+                estimate = bootstrap(run.error[there, h, i] ** 2, blocks.take(there), np.sqrt)
             rows += interval_rows(f"free_run_rmse@{h * dt:g}s", q.name, q.unit, estimate)
     return rows

@@ -68,6 +68,10 @@ class Assessor:
         e[:, :SETTLE] = np.nan
         return Assessment(e, s, horizon, wrap, log_likelihood, free, track)
 
+    def track(self, z: np.ndarray, windows: Windows) -> Track:
+        """Return the filter's track alone."""
+        return self(z, windows).track
+
     def _wrapped(self, error: np.ndarray) -> np.ndarray:
         periodic = {q.name for q in self.plan.augmented.model.states if q.periodic}
         around = np.array([name in periodic for name in self.plan.augmented.measured])

@@ -9,9 +9,9 @@ Reference: Bell (1994), The iterated Kalman smoother as a Gauss-Newton method.
 
 import numpy as np
 
-from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.latent_force import smooth
 from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.tracks import Tracking
 
 PASSES = 4
 WIDE = 3.0  # standard deviations of the smoother
@@ -19,15 +19,15 @@ MOVED = 0.1  # of the spread
 LEAST, MOST = 0.15, 1.0  # of the spread that it began with
 
 
-def begun(assessor: Assessor, z: np.ndarray, windows: Windows) -> Windows:
+def begun(filtering: Tracking, z: np.ndarray, windows: Windows) -> Windows:
     """Return windows with a better guess of the first value of every state that nothing measures.
 
     Args:
-        assessor: of the models.
+        filtering: of the models.
         z: unit coordinates of a model with loud noise.
         windows: whose first states are guessed.
     """
-    augmented = assessor.plan.augmented
+    augmented = filtering.plan.augmented
     states = augmented.model.states
     hidden = [i for i, q in enumerate(states) if q.name not in augmented.measured]
     if not hidden:
@@ -36,7 +36,7 @@ def begun(assessor: Assessor, z: np.ndarray, windows: Windows) -> Windows:
     first = windows.spread[:, hidden]
     for _ in range(PASSES):
         try:
-            found = smooth(assessor(z, windows).track)
+            found = smooth(filtering.track(z, windows))
         except np.linalg.LinAlgError:
             break
         mean = found.mean[:, 0][:, hidden]

@@ -75,6 +75,12 @@ def assemble(
     sigma = encoding.per_target(noise_std, 0.0) / normaliser.y_std
     declared = encoding.per_target(declared_noise, 0.0) / normaliser.y_std
     noise_init, noise_floor = (np.asarray(a) for a in noise.start(sigma, declared))
+    silent = np.any([own.silent for own in training], axis=0)
+    if silent.any():  # the noise of a change is that of both its ends
+        both = np.where(np.arange(encoding.dim_y) < encoding.dim_state, np.sqrt(2), 1.0)
+        noise_init = np.where(silent, np.maximum(both * sigma, noise.floor), noise_init)
+        noise_floor = np.minimum(noise_floor, 0.99 * noise_init)
+        training = [_silenced(own, silent) for own in training]
     rows = [own._replace(y=(own.y - normaliser.y_mean) / normaliser.y_std) for own in training]
     split = [jax.random.split(key) for key in keys]
     chooser = Chooser(prior, bound, system, normaliser, noise, noise_init)
@@ -109,6 +115,11 @@ def assemble(
     setting = Setting(bound, score, lambda key, n: system.domain.sample(key, n, dtype))  # type: ignore[arg-type]
     gap_scale = choices[0].gap * normaliser.y_std if prior.gap is not None else None
     return Assembled(setting, jax.tree.map(stack, *problems), gap_scale, gain)
+
+
+def _silenced(training: Training, silent: np.ndarray) -> Training:
+    """Return training rows none of whose targets tells of the noise of some outputs."""
+    return training._replace(tells=None if training.tells is None else np.where(silent[None], 0.0, training.tells))
 
 
 def _refuse_lost_digits(encoding: Encoding, y_std: np.ndarray, dtype: jnp.dtype) -> None:

@@ -78,6 +78,9 @@ class Problem(NamedTuple):
         return None if self.tail is None else jnp.asarray(self.tail)
 
 
+FEWEST = 5  # targets that tell of an output's noise; of fewer, it is what the measurements say of theirs
+
+
 class Training(NamedTuple):
     """Training transitions of one seed.
 
@@ -92,6 +95,13 @@ class Training(NamedTuple):
     y: np.ndarray
     precision: np.ndarray | None = None
     tells: np.ndarray | None = None
+
+    @property
+    def silent(self) -> np.ndarray:
+        """Return the outputs of which too few targets tell of the noise, (dy,)."""
+        if self.tells is None:
+            return np.zeros(self.y.shape[1], bool)
+        return np.asarray((self.tells > 0).sum(axis=0) < FEWEST)
 
     def take(self, rows: np.ndarray) -> "Training":
         """Return some of the rows."""

@@ -168,6 +168,7 @@ def _looked(chooser: Chooser, training: Training, key: PRNGKeyArray, law: str) -
         for i in range(size)
     ]
     scale, sigma = (np.array(values) for values in zip(*found, strict=True))
+    sigma = np.where(training.silent, chooser.noise_init, sigma)
     gain = gain_of_tails(moments, scale, sigma) if with_law else unknown
     if with_noise:
         sigma = _smooth(chooser, x[rows], moments, sigma)

@@ -26,7 +26,6 @@ SCALES = np.geomspace(0.2, 2.0, 47)  # of the errors' standard deviations
 SPREAD = 0.1  # of an output's tail about the common one
 LEAST_GAIN = 3.0  # nats that Student's t has to be ahead by
 LEAST_ROWS = 20  # fewer tell nothing of a tail
-FEWEST = 5  # rows that tell of an output's noise; of fewer, all are asked
 ROUNDS = 8
 
 
@@ -66,12 +65,16 @@ class Moments(NamedTuple):
     tells: np.ndarray | None = None
 
     def rows(self, i: int) -> np.ndarray:
-        """Return the rows that tell of an output's noise; of too few, all of them."""
+        """Return the rows that tell of an output's noise; of none, all of them."""
         every = np.arange(len(self.targets))
         if self.tells is None:
             return every
         found = np.flatnonzero(self.tells[:, i] > 0)
-        return found if len(found) >= FEWEST else every
+        return found if len(found) else every
+
+    def silent(self, i: int) -> bool:
+        """Whether no row tells of an output's noise, which then stays as it is."""
+        return self.tells is not None and not (self.tells[:, i] > 0).any()
 
     def whitened(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return samples (N, m'), correlation (m', m') and targets (m',) of `rows`, in units in which all count alike."""
@@ -136,6 +139,8 @@ def gain_of_tails(moments: Moments, kappa: np.ndarray, sigma: np.ndarray) -> np.
     """
     total, sigma = np.zeros(len(TAILS)), np.sqrt(sigma**2 + moments.white)
     for i in range(len(sigma)):
+        if moments.silent(i):
+            continue
         covariance, residual = moments.of_output(i, kappa[i])
         found = left_out(covariance, residual, np.full(len(residual), sigma[i] ** 2))
         scores, _ = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))
@@ -159,8 +164,9 @@ def student_t(
     kappa, sigma = kappa.copy(), np.sqrt(sigma**2 + moments.white)
     weights, tail = np.ones((m, size)), np.full(size, 0.25)
     rows = [moments.rows(i) for i in range(size)]
-    told = np.stack([np.isin(np.arange(m), own) for own in rows], axis=1)
-    count = told.sum(axis=0)
+    silent = np.array([moments.silent(i) for i in range(size)], bool)
+    told = np.stack([np.isin(np.arange(m), own) for own in rows], axis=1) & ~silent[None]
+    count = np.maximum(told.sum(axis=0), 1)
     for turn in range(ROUNDS):
         scores = np.zeros((size, len(TAILS)))
         squared = np.zeros((m, size))
@@ -170,12 +176,13 @@ def student_t(
                 sigma[i] = np.sqrt(own**2 + moments.white)
             covariance, residual = moments.of_output(i, kappa[i])
             found = left_out(covariance, residual, sigma[i] ** 2 / weights[rows[i], i])
-            scores[i] = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))[0][1:]
+            if not silent[i]:
+                scores[i] = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))[0][1:]
             squared[rows[i], i] = found.squared
         tail = _tails(scores)
         weights = np.where(told, (1 + tail) / (1 + tail * squared / sigma**2), 1.0)
         # M-step of the scale with its prior, log sigma ~ N(log noise_init, 1), which decides where there are few rows
-        data = np.sum(weights * squared * told, axis=0) / count
+        data = np.where(silent, noise_init**2, np.sum(weights * squared * told, axis=0) / count)
         sigma = np.exp((count * np.log(data) / 2 + np.log(noise_init) / 2) / (count + 0.5))
     return Law(tail, weights, kappa, sigma)
 
@@ -186,6 +193,8 @@ def weights_of(law: Law, moments: Moments) -> np.ndarray:
     weights = np.ones((m, size))
     for _ in range(ROUNDS):
         for i in range(size):
+            if moments.silent(i):
+                continue
             covariance, residual = moments.of_output(i, law.gap[i])
             rows = moments.rows(i)
             found = left_out(covariance, residual, law.scale[i] ** 2 / weights[rows, i])

@@ -173,6 +173,8 @@ def _by_metric(rows: list[dict[str, Any]]) -> Values:
 
 def _shown(estimate: tuple[float, float, float]) -> str:
     value, low, high = estimate
+    if np.isnan(value):
+        return "not measured"
     if np.isnan(low):
         return f"{value:.3g}"
     return f"{value:.3g} ({low:.3g}..{high:.3g})"

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli import evaluation as ev
-from simpel_cli.data import Episode, Places, origins, places, transitions
+from simpel_cli.data import Episode, Places, origins, places, transitions, with_measured_targets
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.runs.files import write_table
 from simpel_cli.studies.open import Study, refuse_untested
@@ -41,7 +41,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     horizon = study.evaluation.steps(dt)
     episodes = study.recording.test
     refuse_untested(study.recording)
-    pairs = transitions(episodes, encoding.stack, encoding.linear)
+    pairs = with_measured_targets(transitions(episodes, encoding.stack, encoding.linear), episodes)
     x, y = ev.test_arrays(pairs, encoding)
     where = _places(study, episodes, pairs.episode, pairs.row)
     blocks = _blocks(study, episodes, where, horizon)
@@ -132,8 +132,7 @@ def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.n
 
 def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, np.ndarray]:
     """Root mean square error of free runs, and the spread that the posterior predicts, by horizon and state."""
-    rmse = np.sqrt((run.error**2).mean(axis=0))
-    claimed = np.sqrt((run.std**2).mean(axis=0))
+    rmse, claimed = (_root_mean(a, run.known) for a in (run.error, run.std))
     steps, ds = rmse.shape
     return {
         "seed": np.full(steps * ds, seed),
@@ -143,6 +142,14 @@ def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, 
         "rmse": rmse.ravel(),
         "claimed_std": claimed.ravel(),
     }
+
+
+def _root_mean(a: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Root mean square over the runs whose state was measured, (H + 1, ds); NaN where none was."""
+    count = known.sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        found: np.ndarray = np.sqrt((np.where(known, a, 0.0) ** 2).sum(axis=0) / count)
+    return found
 
 
 def _trajectories(seed: int, run: ev.FreeRun, study: Study, episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
@@ -163,7 +170,7 @@ def _trajectories(seed: int, run: ev.FreeRun, study: Study, episodes: Sequence[E
         "time": np.repeat(where.time, ds),
         "output": np.tile([q.name for q in states], n),
         "unit": np.tile([q.unit for q in states], n),
-        "measured": run.measured[kept].ravel(),
+        "measured": np.where(run.known, run.measured, np.nan)[kept].ravel(),
         "mean": (run.measured + run.error)[kept].ravel(),
         "std": run.std[kept].ravel(),
     }

@@ -4,8 +4,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from simpel_cli.data import Measurements, Recording, read
+from simpel_cli.data.recording import Source
 from simpel_cli.errors import DataError
 from simpel_cli.evaluation.settings import Evaluation
+from simpel_cli.filtering import estimated_rows
 from simpel_cli.inference.protocols import Method
 from simpel_cli.inference.system import System, system_of
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
@@ -93,10 +95,22 @@ def open_study(
     if groups and isinstance(source, Model):
         source = grouped(source, groups)
     # the split does not depend on run.seed: every seed of a sweep is tested on the same episodes
-    recording = read(measurements, source, data_folder, 0, whole=whole)
+    recording = _read(measurements, source, data_folder, whole=whole)
     if isinstance(source, Model) and recording.groups:
         source = grouped(source.base or source, recording.groups)
     return Study(declared, device, system_of(source, recording.outputs, measurements.stack_actions), recording)
+
+
+def _read(measurements: Measurements, source: Source, data_folder: Path, *, whole: bool) -> Recording:
+    """Read measurements; where rows are needed whole and are not, the simulator's filter estimates what they lack."""
+    fills = whole and isinstance(source, Model)
+    recording = read(measurements, source, data_folder, 0, whole=whole, partial=True if fills else None)
+    if not fills or estimated_rows.whole(recording):
+        return recording
+    if not estimated_rows.enough(recording):  # a few rows calibrate no filter: those that are whole count
+        return read(measurements, source, data_folder, 0)
+    assert isinstance(source, Model)
+    return estimated_rows.with_estimates(recording, source, tuple(measurements.noise_std))
 
 
 def refuse_untested(recording: Recording) -> None:

@@ -111,5 +111,4 @@ def test_moments_are_those_of_the_rows_that_tell() -> None:
     plain = np.cov(samples[:, rows, 0], rowvar=False) + 0.25 * np.eye(6)
     np.testing.assert_allclose(covariance, plain * np.outer(root, root))
     np.testing.assert_allclose(residual, (targets[rows, 0] - samples[:, rows, 0].mean(axis=0)) * root)
-    few = moments._replace(tells=np.eye(8)[:, :1])
-    assert len(few.rows(0)) == 8
+    assert len(moments._replace(tells=np.zeros((8, 1))).rows(0)) == 8

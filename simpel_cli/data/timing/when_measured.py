@@ -79,6 +79,7 @@ def when_measured(
     labels: np.ndarray | None,
     *,
     partial: bool,
+    ranges: bool,
 ) -> tuple[Rows, Check | None]:
     """Bring every value to the row that follows the instant at which it was measured.
 
@@ -91,6 +92,7 @@ def when_measured(
         joined: tables of other sensors.
         labels: (n,) name that the main table gives the episode of each row; None: it gives none.
         partial: whether a row may lack a value, and a value may be late.
+        ranges: whether a latency may be a range, which is to be estimated.
 
     Returns:
         The rows, and what was done; None: every value was measured at its row.
@@ -100,7 +102,7 @@ def when_measured(
         DataError: a latency is longer than an episode, clocks that run backwards or never meet, or rows have to be whole.
     """
     sensors = _sensors(config, model, mapping)
-    if not partial:
+    if not ranges:
         _refuse_ranges(config, mapping)
     if not sensors:
         return rows, None
