@@ -1,7 +1,7 @@
 """The filter's course along windows, without errors ahead: one compiled program."""
 
 from functools import lru_cache, partial
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 
 
+@runtime_checkable
 class Tracking(Protocol):
     """Whatever runs a setup's filter along windows."""
 

@@ -27,10 +27,12 @@ def way_back(
         row_before: state and rate at the row before, and the time since, s.
     """
     x_0, rate_0, step = row_before
-    s = 1 - early / step
+    s = 1 - early / step[None]
     back, along, here = (1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2, s**2 * (s - 1)
     return (
-        back[:, None] * (x_0 - x)[None] + along[:, None] * (step * rate_0)[None] + here[:, None] * (step * rate)[None]
+        back[:, None] * (x_0 - x)[None]
+        + along[:, None] * (step[None] * rate_0)[None]
+        + here[:, None] * (step[None] * rate)[None]
     )
 
 

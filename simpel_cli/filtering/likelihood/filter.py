@@ -117,10 +117,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
     stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
 
-    def length(u: Array) -> Array | float:
-        """Return the length of a substep, s."""
+    def length(u: Array, axes: int = 1) -> Array | float:
+        """Return the length of a substep, s, for a value with so many axes of its own."""
         pace = pace_of(u)
-        return dt / substeps if pace is None else dt / substeps * pace
+        return dt / substeps if pace is None else (dt / substeps * pace).reshape((1,) * axes + pace.shape)
 
     def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
         """Return the state one row later, and the rate there."""
@@ -143,10 +143,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, None]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
-            h = length(u)
+            h, h_phi = length(u), length(u, 2)
             slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
-            slope_phi = apart(product(rate_x, apart(phi + h * weights[0] * slope_phi)))
-            after, after_phi = total + h * weights[1] * slope, total_phi + h * weights[1] * slope_phi
+            slope_phi = apart(product(rate_x, apart(phi + h_phi * weights[0] * slope_phi)))
+            after, after_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
             return (x, phi, after, after_phi, slope, slope_phi, rate_x), None
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
@@ -270,7 +270,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
         """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
         slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0, 0], u[-1, -1]), strict=True)), jnp.zeros(()))
-        change = substeps * length(u[0, 0]) / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
+        change = substeps * length(u[0, 0], 2) / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
         return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
 
     def moved(
