@@ -24,10 +24,10 @@ def world_of_posterior(learned: Learned, asked: Assignment) -> Callable[[tuple[P
     def world_at(arrays: tuple[Problem, Any], share: float) -> World:
         problem, state = arrays
         rule = learned.fitted.bind(problem)
-        law = rule.predict(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype))
+        law = (rule.typical or rule.predict)(state, jnp.zeros((1, encoding.dim_x), problem.x.dtype))
         world = learned_world(
             encoding, asked.goal, lambda x: rule.members(state, x), law.noise_scale, study.method.particles, control.sampling,
-            aleatoric=control.aleatoric, tail=law.tail,
+            aleatoric=control.aleatoric, tail=law.tail, relative=rule.relative,
         )  # fmt: skip
         return beginning_at(world, encoding, jnp.asarray(problem.x), jnp.asarray(problem.m), share)
 

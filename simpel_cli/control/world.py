@@ -135,6 +135,7 @@ def learned_world(
     *,
     aleatoric: bool = True,
     tail: Float[Array, " dy"] | None = None,
+    relative: Callable[[Float[Array, "n dx"], Float[Array, "n dy"]], Float[Array, "n dy"]] | None = None,
 ) -> World:
     """Return the world of a posterior.
 
@@ -147,6 +148,7 @@ def learned_world(
         sampling: `ts1` a particle drawn anew at every step, `tsinf` one for a whole roll-out, `mean` the mean of all.
         aleatoric: whether noise is added (never to the mean).
         tail: 1/nu of noise that is Student's t; None: it is Gaussian.
+        relative: inputs and targets to the noise of each over `noise_scale`; None: 1.
 
     Reference: Chua et al. (2018), Deep reinforcement learning in a handful of trials, section 5 (trajectory sampling).
     """
@@ -169,7 +171,8 @@ def learned_world(
             error = jax.random.normal(key_noise, y.shape, y.dtype)
         else:
             error = jax.random.t(key_noise, jnp.broadcast_to(1 / tail[None], y.shape).astype(y.dtype), y.shape, y.dtype)
-        return y + noise_scale[None].astype(y.dtype) * error
+        scale = noise_scale[None].astype(y.dtype)
+        return y + (scale if relative is None else scale * relative(x, y).astype(y.dtype)) * error
 
     return world_of(encoding, goal, follow, multiple=1 if sampling == "mean" else particles)
 

@@ -6,11 +6,13 @@ from typing import Any, ClassVar
 
 from simpel_cli.data.timing.keys import JOIN, LATENCY, Join, read_join, read_latency, read_times
 from simpel_cli.errors import ConfigError, did_you_mean
+from simulators.expression import ExpressionError, symbols_used
 from simulators.quantity import BETWEEN_ROWS
 
 LAYOUTS = ("trajectories", "transitions")
 CHOICES = ("random", "first")
 LAWS = ("auto", "gaussian", "student_t")
+NOISE = ("law", "scale")
 SPLIT_BY = ("episode", "time")
 OF_INPUTS = {  # what to do where one is named
     "latency": "only states and outputs are recorded late. One that acts late is sim.inputs.{0}.delay.",
@@ -44,6 +46,8 @@ class Measurements:
             at the simulator's dt and is estimated where absent.
         noise: `{law: gaussian}`, or `student_t` with degrees of freedom that are learned per output, for measurements of which
             some lie far off; `auto`: what the training rows say, by their leave-one-out log score.
+            `scale: {y: 0.01 + 0.05*abs(y)}`: how the scale of the noise of a measured state or output goes with the states,
+            inputs and outputs of its row, in their units. Only the shape matters: how large the noise is, is learned.
         resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.
         layout: `trajectories` (rows follow each other) or `transitions` (next values in `next_<state column>`).
         n_train: number of training transitions to use; null = all, 0 = none: the posterior is the prior.
@@ -109,7 +113,14 @@ class Measurements:
             },
             "additionalProperties": False,
         },
-        "noise": {"type": "object", "properties": {"law": {"enum": list(LAWS)}}, "additionalProperties": False},
+        "noise": {
+            "type": "object",
+            "properties": {
+                "law": {"enum": list(LAWS)},
+                "scale": {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
+            },
+            "additionalProperties": False,
+        },
         "between_rows": {"type": "object", "additionalProperties": {"enum": list(BETWEEN_ROWS)}},
         "latency": LATENCY,
         "join": JOIN,
@@ -129,8 +140,11 @@ class Measurements:
         for name, std in self.noise_std.items():
             _positive(f"noise_std.{name}", std)
         for key in self.noise:
-            if key != "law":
-                raise ConfigError(f"data.noise.{key}: no such key, only law.{did_you_mean(key, ['law'])}")
+            if key not in NOISE:
+                raise ConfigError(
+                    f"data.noise.{key}: no such key, only {' or '.join(NOISE)}.{did_you_mean(key, NOISE)}"
+                )
+        _check_scale(self.noise.get("scale"))
         _one_of("noise.law", self.law, LAWS)
         for name, word in self.between_rows.items():
             _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
@@ -184,6 +198,11 @@ class Measurements:
         """Law of the noise: auto, gaussian or student_t."""
         return str(self.noise.get("law", "auto"))
 
+    @property
+    def noise_scale(self) -> Mapping[str, Any]:
+        """Scale of the noise, state or output -> expression; empty: the same in every row."""
+        return self.noise.get("scale") or {}
+
     def seed_or(self, run_seed: int) -> int:
         """Return the seed of the split and of the choice: its own if declared, else the run's."""
         return run_seed if self.seed is None else self.seed
@@ -202,6 +221,7 @@ class Measurements:
             ("columns", self.columns, quantities),
             ("units", self.units, quantities),
             ("noise_std", self.noise_std, measurable),
+            ("noise.scale", self.noise_scale, measurable),
             ("derived", self.derived, measurable),
             ("between_rows", self.between_rows, tuple(name for name in quantities if name not in measurable)),
             ("latency", self.latency, measurable),
@@ -224,6 +244,23 @@ def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         hint = did_you_mean(str(value), list(allowed))
         raise ConfigError(f"data.{key}: {value!r} is not allowed, only {' or '.join(allowed)}.{hint}")
+
+
+def _check_scale(scale: Any) -> None:
+    if scale is not None and not isinstance(scale, Mapping):
+        raise ConfigError(
+            f"data.noise.scale: {scale!r} is not allowed, only expressions by name, e.g. {{y: 0.01 + 0.05*abs(y)}}."
+        )
+    for name, formula in (scale or {}).items():
+        if not isinstance(formula, str):
+            _positive(f"noise.scale.{name}", formula)
+            if formula is None:
+                raise ConfigError(f"data.noise.scale.{name}: no expression. Write one, e.g. 0.01 + 0.05*abs({name}).")
+            continue
+        try:
+            symbols_used(formula)
+        except ExpressionError as error:
+            raise ConfigError(f"data.noise.scale.{name}: {error}") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -1,5 +1,6 @@
 """Free runs: the posterior runs on its own predictions along measured inputs."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,12 +84,13 @@ def rollout(
         inputs: stacked inputs, shape (W, H, dim_inputs).
 
     Returns:
-        States of every particle (H + 1, L, W, ds), physical units, and the noise per state (ds,).
+        States of every particle (H + 1, L, W, ds), physical units, and the noise per state: (ds,), or of every row along the
+        mean of the particles (H + 1, W, ds).
     """
     w = len(states)
     noise = noise_of(posterior, encoding)
     encoded = np.broadcast_to(encoding.encode(states)[None], (posterior.particles, w, encoding.dim_state))
-    path = [encoded]
+    path, outputs = [encoded], []
     for h in range(inputs.shape[1]):
         along = np.broadcast_to(inputs[None, :, h], (posterior.particles, w, inputs.shape[2]))
         x = np.concatenate([encoded, along], axis=-1)
@@ -96,12 +98,37 @@ def rollout(
         y = np.asarray(posterior.members(np.pad(x, [(0, 0), (0, pad), (0, 0)], mode="edge")), dtype=float)[:, :w]
         encoded = encoding.advance(encoded, y)
         path.append(encoded)
+        outputs.append(y[..., encoding.dim_state :].mean(axis=0))
+    if posterior.relative is not None:
+        noise = noise * _relative_noise(posterior.relative, encoding, path, inputs, outputs)
     per_state, i = [], 0
     for q in encoding.states:
         # an angle's variance is the sum of those of its sine, s^2 cos^2, and cosine, s^2 sin^2
-        per_state.append(np.hypot(noise[i], noise[i + 1]) if q.periodic else noise[i])
+        per_state.append(np.hypot(noise[..., i], noise[..., i + 1]) if q.periodic else noise[..., i])
         i += 2 if q.periodic else 1
-    return encoding.decode(np.stack(path)), np.array(per_state)
+    return encoding.decode(np.stack(path)), np.stack(per_state, axis=-1)
+
+
+def _relative_noise(
+    relative: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    encoding: Encoding,
+    path: list[np.ndarray],
+    inputs: np.ndarray,
+    outputs: list[np.ndarray],
+) -> np.ndarray:
+    """Return the noise of one measurement in every row of a run over the typical one, (H + 1, W, dy).
+
+    Inputs and outputs of the last row are not known: they stay.
+    """
+    found = []
+    for h, encoded in enumerate(path):
+        k = min(h, len(outputs) - 1)
+        # a measurement has the inputs of its row alone
+        held = encoding.stacked(encoding.input_rows(inputs[:, k])[:, [*range(encoding.stack + 1), encoding.stack]])
+        x = np.concatenate([encoding.encode(encoding.decode(encoded.mean(axis=0))), held], axis=-1)
+        still = np.zeros((len(x), encoding.dim_state))
+        found.append(relative(x, np.concatenate([still, outputs[k]], axis=-1)))
+    return np.stack(found)
 
 
 def _circular_moments(particles: np.ndarray, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:

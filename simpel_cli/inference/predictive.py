@@ -17,18 +17,33 @@ class Predictive(NamedTuple):
 
     Args:
         particles: function values.
-        noise_scale: scale of the observation noise, shared by the particles: of a Gaussian its standard deviation.
+        noise_scale: scale of the observation noise, shared by the particles: of a Gaussian its standard deviation. (dy,), the
+            same in every row, or (n, dy), one of every row.
         tail: 1/nu of Student's t, positive; None: the noise is Gaussian.
     """
 
     particles: Float[Array, "L n dy"]
-    noise_scale: Float[Array, " dy"]
+    noise_scale: Float[Array, "*rows dy"]
     tail: Float[Array, " dy"] | None = None
 
     @property
-    def noise_std(self) -> Float[Array, " dy"]:
-        """Standard deviation of the observation noise."""
-        return student_t.standard_deviation(jnp.asarray(self.noise_scale), self.tail)
+    def noise_std(self) -> Float[Array, "*rows dy"]:
+        """Standard deviation of the observation noise, of the shape of its scale."""
+        scale = jnp.asarray(self.noise_scale)
+        tail = self.tail if self.tail is None or scale.ndim == 1 else self.tail[None]
+        return student_t.standard_deviation(scale, tail)
+
+    @property
+    def _scales(self) -> Float[Array, "rows dy"]:
+        """Scale of the noise row by row; one row where it is the same in all."""
+        scale = jnp.asarray(self.noise_scale)
+        return scale if scale.ndim == 2 else scale[None]
+
+    @property
+    def _noise_variance(self) -> Float[Array, "rows dy"]:
+        """Variance of the noise row by row; one row where it is the same in all."""
+        std = self.noise_std
+        return (std if std.ndim == 2 else std[None]) ** 2
 
     @property
     def mean(self) -> Float[Array, "n dy"]:
@@ -43,7 +58,7 @@ class Predictive(NamedTuple):
     @property
     def std(self) -> Float[Array, "n dy"]:
         """Standard deviation of the mixture: epistemic and noise."""
-        return jnp.sqrt(jnp.var(self.particles, axis=0) + self.noise_std[None] ** 2)
+        return jnp.sqrt(jnp.var(self.particles, axis=0) + self._noise_variance)
 
     def log_prob(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Log density of the mixture, joint over outputs."""
@@ -56,11 +71,11 @@ class Predictive(NamedTuple):
     def _log_densities(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
         z = self._standardised(y)
         if self.tail is None:
-            return -0.5 * z * z - jnp.log(self.noise_scale)[None, None] - 0.5 * jnp.log(2 * jnp.pi).astype(z.dtype)
-        return student_t.log_density(z, self.tail[None, None]) - jnp.log(self.noise_scale)[None, None]
+            return -0.5 * z * z - jnp.log(self._scales)[None] - 0.5 * jnp.log(2 * jnp.pi).astype(z.dtype)
+        return student_t.log_density(z, self.tail[None, None]) - jnp.log(self._scales)[None]
 
     def _standardised(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
-        return (y[None] - self.particles) / self.noise_scale[None, None]
+        return (y[None] - self.particles) / self._scales[None]
 
     def cdf(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Cumulative distribution of each output's mixture at y (the probability integral transform)."""
@@ -74,7 +89,7 @@ class Predictive(NamedTuple):
         Reference: Grimit, Gneiting, Berrocal and Johnson (2006), the closed form for Gaussian mixtures; for those of
         Student's t the same difference of expectations.
         """
-        sigma = self.noise_scale[None]
+        sigma = self._scales
         if self.tail is None:
 
             def spread(member: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
@@ -111,7 +126,7 @@ class Predictive(NamedTuple):
             noise = jax.random.normal(key_noise, (draws, n, dy), y.dtype)
         else:
             noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=y.dtype)
-        others = jax.lax.map(self.mahalanobis, centres + self.noise_scale[None, None] * noise)
+        others = jax.lax.map(self.mahalanobis, centres + self._scales[None] * noise)
         nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
         return (nearer + 0.5) / (draws + 1)
 
@@ -119,7 +134,7 @@ class Predictive(NamedTuple):
         """Return y about the mixture's mean, in units of its covariance."""
         centred = self.particles - self.mean[None]
         covariance = jnp.einsum("lni,lnj->nij", centred, centred) / self.particles.shape[0]
-        covariance = covariance + jnp.diag(self.noise_std**2)[None]
+        covariance = covariance + self._noise_variance[:, :, None] * jnp.eye(y.shape[1], dtype=y.dtype)[None]
         factor = jnp.linalg.cholesky(covariance)
         white = jax.scipy.linalg.solve_triangular(factor, (y - self.mean)[..., None], lower=True)
         return white[..., 0]

@@ -79,6 +79,7 @@ def check_prior(
     gap_scale: np.ndarray | None,
     key: PRNGKeyArray,
     bank: Bank | None = None,
+    relative: np.ndarray | None = None,
 ) -> PriorCheck | None:
     """Compare the training targets with draws of the prior; None: there are too few draws to tell.
 
@@ -94,6 +95,7 @@ def check_prior(
         gap_scale: (dy,) kappa, normalised; None: no gap.
         key: of the draws.
         bank: draws at the training inputs, where the simulator can only be queried.
+        relative: (m, dy) noise of every target over the typical one; None: 1.
     """
     rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), MOST_ROWS)).round().astype(int))
     x, y = x[rows], y[rows]
@@ -102,7 +104,7 @@ def check_prior(
     if 1 / (1 + len(drawn) // 2) > SURPRISING:
         return None
     samples, targets = (drawn - y_mean) / y_std, (y - y_mean) / y_std  # (N, m, dy), (m, dy)
-    noise = measurement_noise(system, x, noise_std, key) / y_std
+    noise = measurement_noise(system, x, noise_std, key, None if relative is None else relative[rows]) / y_std
     at = jnp.asarray((x - normaliser.x_mean) / normaliser.x_std, jnp.float64)
     scale = np.zeros(y.shape[1]) if gap_scale is None else np.asarray(gap_scale, float)
     known = np.asarray(setting.prior.covariance(at, jnp.asarray(scale)), float)  # with the white model error
@@ -131,24 +133,28 @@ def check_prior(
     return PriorCheck(tuple(checks), table)
 
 
-def measurement_noise(system: System, x: np.ndarray, noise_std: Mapping[str, float], key: PRNGKeyArray) -> np.ndarray:
+def measurement_noise(
+    system: System, x: np.ndarray, noise_std: Mapping[str, float], key: PRNGKeyArray, relative: np.ndarray | None = None
+) -> np.ndarray:
     """Return the standard deviation of measured targets about those of a right simulator at the measured inputs, (m, dy).
 
     The simulator starts from a measured state, so that state's noise counts, too, by what the simulator makes of it:
     sigma_i^2 + sum_s (d next_i / d s)^2 sigma_s^2. Where it can only be queried, d next / d s is taken for 1.
+    `relative` (m, dy) is what the noise of a target is of the typical one; None: 1.
     """
     encoding = system.encoding
-    own = encoding.per_target(noise_std, 0.0)
+    uneven = np.ones((len(x), encoding.dim_y)) if relative is None else relative
+    own = encoding.per_target(noise_std, 0.0) * uneven
     changes = np.arange(encoding.dim_y) < encoding.dim_state
     noisy = [(j, noise_std[q.name]) for j, q in enumerate(encoding.states) if noise_std.get(q.name)]
     if not noisy:
-        return np.broadcast_to(own, (len(x), encoding.dim_y))
+        return own
     if system.transition is None:
-        return np.broadcast_to(np.where(changes, 2**0.5, 1.0) * own, (len(x), encoding.dim_y))
+        return np.where(changes, 2**0.5, 1.0) * own
     states, inputs = encoding.split_x(x)
     moved = np.tile(states, (len(noisy), 1, 1))
     for k, (j, sigma) in enumerate(noisy):
-        moved[k, :, j] += sigma
+        moved[k, :, j] += sigma * uneven[:, list(encoding.quantity_of_target).index(j)]
     every = np.stack([x, *(encoding.to_x(each, inputs) for each in moved)])
     # all in one call: the same draws of the parameters, and one program
     means = system.simulate(key, every.reshape(-1, encoding.dim_x), NOISE_DRAWS).mean(axis=0)

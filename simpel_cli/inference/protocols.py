@@ -50,6 +50,7 @@ class Problem(NamedTuple):
     is 1/nu; None: it is Gaussian. `precision` is how much every target counts: its noise has the variance sigma^2/precision, or
     None: all count alike; where `tells` is 0, the target says nothing of sigma (it was estimated, or lies at a sensor's end).
     `weights` is what a rule in closed form takes of both, precision times expected weight under Student's t; None: 1.
+    `noise_rms` is the typical scale of every target's noise in the unit of its expression (`noise_scale`); None: it has none.
     """
 
     x: Float[Numbers, "m_padded dx"]
@@ -64,6 +65,7 @@ class Problem(NamedTuple):
     weights: Float[Numbers, "m_padded dy"] | None = None
     precision: Float[Numbers, "m_padded dy"] | None = None
     tells: Float[Numbers, "m_padded dy"] | None = None
+    noise_rms: Float[Numbers, " dy"] | None = None
 
     def counted(self, rows: Int[Array, " b"] | None = None) -> "Counted | None":
         """Return how much targets count; rows: which of them, None: all; None: all count alike."""
@@ -210,6 +212,8 @@ class Inference(NamedTuple):
     init(key) -> State; draw(key, State at its beginning) -> material for a stretch of steps that is not worth keeping;
     step(key, State, what was drawn) -> (State, Info); predict(State, x in data units) -> Predictive in data units;
     members(State, x of every particle) -> targets of every particle, for roll-outs along each particle's own path.
+    Where the noise differs from row to row: typical is predict with the noise of a typical row; relative(x, targets) -> noise
+    of every row's targets over the typical one. None: it is the same in every row.
     """
 
     init: Callable[[PRNGKeyArray], Any]
@@ -217,6 +221,8 @@ class Inference(NamedTuple):
     step: Callable[[PRNGKeyArray, Any, Any], tuple[Any, Any]]
     predict: Callable[[Any, Float[Array, "n dx"]], Predictive]
     members: Callable[[Any, Float[Array, "L n dx"]], Float[Array, "L n dy"]]
+    typical: Callable[[Any, Float[Array, "n dx"]], Predictive] | None = None
+    relative: Callable[[Float[Array, "n dx"], Float[Array, "n dy"]], Float[Array, "n dy"]] | None = None
 
 
 @runtime_checkable

@@ -40,7 +40,7 @@ def information(tail: Float[Array, "*d"]) -> tuple[Float[Array, "*d"], Float[Arr
     return (1 + tail) / (1 + 3 * tail), 2 / (1 + 3 * tail)
 
 
-def standard_deviation(scale: Float[Array, " d"], tail: Float[Array, " d"] | None) -> Float[Array, " d"]:
+def standard_deviation(scale: Float[Array, "*n"], tail: Float[Array, "*m"] | None) -> Float[Array, "*n"]:
     """Return the standard deviation of a scale; tail None: of a Gaussian they are the same."""
     return scale if tail is None else scale / jnp.sqrt(1 - 2 * tail)
 

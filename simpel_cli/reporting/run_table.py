@@ -61,7 +61,11 @@ def _kappa(study: Study, fitted: Fitted) -> str:
 def law_of_noise(study: Study, fitted: Fitted) -> str:
     """Return the law of the noise of a fit, and what it was chosen by."""
     names = study.system.encoding.y_names
-    return law_in_words(fitted.assembled, study.measurements.law, names, learned=study.method.noise.learn)
+    law = law_in_words(fitted.assembled, study.measurements.law, names, learned=study.method.noise.learn)
+    if fitted.scale is None:
+        return law
+    shapes = ", ".join(f"{name} as {formula}" for name, formula in fitted.scale.formulas.items())
+    return f"{law}; its scale goes with the row, of {shapes}, and is given for a typical one"
 
 
 def law_in_words(assembled: Assembled, asked: str, names: Sequence[str], *, learned: bool) -> str:

@@ -56,6 +56,8 @@ def evaluate(job: Job, screen: Screen) -> None:
         refuse_changed_inputs(record.get("inputs_sha256") or {}, study.recording.files, config)
         step, state, fitted = checkpointed_state(run, prepare(study, law_kept(run)))
         judged_on = _new_measurements(study, own, job, record) if own.get("data") else study
+        if fitted.scale is not None:
+            fitted.scale.refuse_wrong(judged_on.recording)
         manifest.add_inputs(judged_on.recording.files)
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")
@@ -76,6 +78,12 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     data = {"stack_actions": study.measurements.stack_actions} | own["data"]
     for key in ("between_rows", "latency"):  # as the rig was, where the new data do not say otherwise
         data[key] = dict(getattr(study.measurements, key)) | (data.get(key) or {})
+    scale = (data.get("noise") or {}).get("scale")
+    if scale and scale != study.measurements.noise_scale:
+        raise ConfigError(
+            f"data.noise.scale: {scale}, but the run was fitted with {dict(study.measurements.noise_scale) or 'none'}, and is "
+            "judged with its own noise. Leave it out, or fit again."
+        )
     choices = study.choices | {"data": own["choices"].get("data", "")}
     declared = study.declared._replace(config=study.declared.config | {"choices": choices})
     other = _opened_whole(declared, data, job.data_folder, study.recording.groups)

@@ -12,11 +12,13 @@ from simpel_cli.data import Transitions, no_transitions, select, transitions
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference.assemble import Assembled, assemble
-from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting, Training
+from simpel_cli.inference.noise_scale import LEAST, NoiseScale, noise_scale_of, with_noise_of_rows
+from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting, Training, multiplied
 from simpel_cli.inference.system import normaliser_of
 from simpel_cli.runs.settings import stream
 from simpel_cli.studies.open import Study
 
+SCALE_POINTS = 1000  # of the simulator's ranges, where there are no measurements to find the typical noise of
 STRETCH = 500  # steps per call of the compiled program; the draws of the prior are refreshed as often
 
 
@@ -29,6 +31,8 @@ class Fitted(NamedTuple):
     training: list[Training]
     available: int  # training transitions that `data.n_train` chose from
     normaliser: Normaliser
+    scale: NoiseScale | None = None  # of the measurement noise, where it differs from row to row
+    relative: list[np.ndarray | None] | None = None  # of every seed, that of its training targets over the typical one
 
     @property
     def n_train(self) -> int:
@@ -55,14 +59,19 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
     outputs = len(study.recording.outputs)
     pairs = transitions(recorded, *carried) if recorded else no_transitions(source, outputs, *carried)
     alike = bool((pairs.weight == 1).all())
-    training = [
-        training_arrays(
-            select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), encoding, alike=alike
-        )
-        for seed in settings.all_seeds
-    ]
     # one normaliser for all seeds and all n_train: results stay comparable
     normaliser = normaliser_of(study.system, stream(0, "normaliser"))
+    scale = noise_scale_of(measurements.noise_scale, encoding, _unmeasured(study))
+    typical, of_pairs = (None, lambda chosen: None) if scale is None else _scaled(study, scale, pairs, normaliser)
+    chosen = [
+        select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed))
+        for seed in settings.all_seeds
+    ]
+    relative = [of_pairs(own) for own in chosen]
+    training = [
+        training_arrays(own, encoding, alike=alike, relative=uneven)
+        for own, uneven in zip(chosen, relative, strict=True)
+    ]
     assembled = assemble(
         study.system,
         normaliser,
@@ -78,29 +87,70 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
         law=measurements.law,
         kept_law=kept_law,
     )
+    if typical is not None:
+        every = jnp.asarray(np.tile(typical, (settings.seeds, 1)), assembled.problems.x.dtype)
+        assembled = assembled._replace(problems=assembled.problems._replace(noise_rms=every))
     keys = jnp.stack([stream(seed, "train") for seed in settings.all_seeds])
-    return Fitted(assembled, _bound(study.method, assembled.setting), keys, training, len(pairs.row), normaliser)
+    bind = _bound(study.method, assembled.setting, scale)
+    return Fitted(assembled, bind, keys, training, len(pairs.row), normaliser, scale, relative)
 
 
-def training_arrays(pairs: Transitions, encoding: Encoding, *, alike: bool) -> Training:
+def _unmeasured(study: Study) -> tuple[str, ...]:
+    """Return the names of the states and outputs that were not measured."""
+    measured = study.recording.outputs
+    return (*study.recording.estimated, *(q.name for q in study.system.source.outputs if q.name not in measured))
+
+
+def _scaled(
+    study: Study, scale: NoiseScale, pairs: Transitions, normaliser: Normaliser
+) -> tuple[np.ndarray, Callable[[Transitions], np.ndarray | None]]:
+    """Return the typical scale of the noise of every target, (dy,), and the map from training transitions to relative ones.
+
+    Typical is the root mean square over all training transitions, one for all seeds and all n_train; where nothing was
+    measured, over the simulator's ranges.
+
+    Raises:
+        DataError: an expression is no scale somewhere.
+    """
+    recorded, encoding = study.recording.train, study.system.encoding
+    scale.refuse_wrong(study.recording)
+    measured = scale.of_transitions(recorded, pairs)
+    if not len(measured):
+        x = np.asarray(study.system.domain.sample(stream(0, "noise_scale"), SCALE_POINTS, jnp.float64))
+        spread = np.random.default_rng(0).normal(size=(len(x), encoding.dim_y)) * normaliser.y_std
+        measured = scale.of_ranges(x, np.asarray(normaliser.y_mean + spread))
+    typical = np.sqrt(np.mean(measured**2, axis=0))
+    if np.allclose(measured, typical, rtol=1e-9, atol=0):  # the noise is the same in every training row
+        return typical, lambda chosen: None
+    return typical, lambda chosen: np.maximum(scale.of_transitions(recorded, chosen) / typical, LEAST)
+
+
+def training_arrays(
+    pairs: Transitions, encoding: Encoding, *, alike: bool, relative: np.ndarray | None = None
+) -> Training:
     """Return network inputs and targets in data units; a change that was estimated counts as far as it is known.
 
     Args:
         pairs: training transitions.
         encoding: coordinates.
-        alike: whether all targets count alike.
+        alike: whether all targets count alike, but for their noise.
+        relative: scale of every target's noise over the typical one, (m, dy); None: 1.
     """
     x, y = test_arrays(pairs, encoding)
-    if alike:
+    if alike and relative is None:
         return Training(x, y)
     weight = pairs.weight[:, encoding.quantity_of_target]
+    counts = multiplied(weight, None if relative is None else relative**-2)
     # what was estimated by the simulator agrees with it: it tells nothing of the noise
-    return Training(x, y, weight, (weight == 1).astype(float))
+    return Training(x, y, counts, (weight == 1).astype(float))
 
 
-def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:
+def _bound(method: Method, setting: Setting, scale: NoiseScale | None) -> Callable[[Problem], Inference]:
     def bind(problem: Problem) -> Inference:
-        return method.bind(setting, problem)
+        rule = method.bind(setting, problem)
+        if scale is None or problem.noise_rms is None:
+            return rule
+        return with_noise_of_rows(rule, scale, problem.noise_rms)
 
     return bind
 
@@ -110,14 +160,21 @@ def posteriors(study: Study, fitted: Fitted, state: Any) -> list[Posterior]:
     bind, assembled = fitted.bind, fitted.assembled
     predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
     members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
-    dtype = assembled.problems.x.dtype
+    typical = jax.jit(lambda problem, state, x: study.method.bind(assembled.setting, problem).predict(state, x))
+    dtype, scale = assembled.problems.x.dtype, fitted.scale
 
     def of_seed(i: int) -> Posterior:
         problem, own = jax.tree.map(lambda a: a[i], (assembled.problems, state))
-        return Posterior(
+        found = Posterior(
             predict=lambda x: predict(problem, own, jnp.asarray(x, dtype)),
             members=lambda x: members(problem, own, jnp.asarray(x, dtype)),
             particles=study.method.particles,
+        )
+        if scale is None:
+            return found
+        return found._replace(
+            typical=lambda x: typical(problem, own, jnp.asarray(x, dtype)),
+            relative=lambda x, y: scale.relative(x, y, np.asarray(problem.noise_rms, float)),
         )
 
     return [of_seed(i) for i in range(study.settings.seeds)]

@@ -15,8 +15,9 @@ def prior_check(study: Study, fitted: Fitted) -> PriorCheck | None:
         return None
     problem = jax.tree.map(lambda a: np.asarray(a[0]), fitted.assembled.problems)
     x, y = fitted.training[0][:2]
+    relative = fitted.relative[0] if fitted.relative else None
     gap_scale = None if study.prior.gap is None else problem.gap_scale
     return check_prior(
         study.system, fitted.assembled.setting, fitted.normaliser, x, y, study.recording.noise_std, gap_scale,
-        stream(0, "prior_predictive"), problem.bank,
+        stream(0, "prior_predictive"), problem.bank, relative,
     )  # fmt: skip
