@@ -33,7 +33,7 @@ class OneStep(NamedTuple):
     epistemic_std: np.ndarray  # (n, dy)
 
 
-def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
+def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.ndarray | None = None) -> OneStep:
     """Compare one-step predictions with targets.
 
     The joint columns: NLL of the joint mixture; squared, absolute error and CRPS summed over outputs; coverage and
@@ -43,8 +43,11 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
         posterior: the fitted posterior.
         x: test inputs, shape (n, dx).
         y: targets, shape (n, dy).
+        precision: of every target over that of one between measured values, shape (n, dy): the noise of one that begins at an
+            estimated state has its variance, too; None: 1.
     """
-    parts = [_one_chunk(posterior, x[i : i + CHUNK], y[i : i + CHUNK]) for i in range(0, len(x), CHUNK)]
+    counts = np.ones_like(y) if precision is None else precision
+    parts = [_one_chunk(posterior, *(a[i : i + CHUNK] for a in (x, y, counts))) for i in range(0, len(x), CHUNK)]
     return OneStep(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -64,11 +67,13 @@ def _measure(p: Predictive, y: jax.Array) -> tuple[jax.Array, ...]:
     return columns
 
 
-def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray) -> OneStep:
+def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.ndarray) -> OneStep:
     n, dy = y.shape
     pad = [(0, CHUNK - n), (0, 0)]
     p = posterior.predict(np.pad(x, pad, mode="edge"))
     p = jax.tree.map(lambda a: a.astype(jnp.float64), p)
+    if (precision != 1).any():
+        p = p.counting(jnp.asarray(np.pad(precision, pad, mode="edge")))
     columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
     nll, joint, crps, pit, r, distance, mean, std, epistemic = columns
     if p.tail is not None:  # a share of the mass: the distance that a Gaussian of the same share would have

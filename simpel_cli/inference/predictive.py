@@ -45,6 +45,10 @@ class Predictive(NamedTuple):
         std = self.noise_std
         return (std if std.ndim == 2 else std[None]) ** 2
 
+    def counting(self, precision: Float[Array, "n dy"]) -> "Predictive":
+        """Return the predictive of targets whose noise has a variance so many times smaller."""
+        return self._replace(noise_scale=self._scales / jnp.sqrt(precision))
+
     @property
     def mean(self) -> Float[Array, "n dy"]:
         """Mean of the mixture."""

@@ -58,7 +58,7 @@ def judge(study: Study, posteriors: list[ev.Posterior], target_std: np.ndarray, 
     distinct = [ev.distinct_particles(posterior, x) for posterior in posteriors]
     run = None
     for seed, posterior, number in zip(study.settings.all_seeds, posteriors, distinct, strict=True):
-        result = ev.one_step(posterior, x, y)
+        result = ev.one_step(posterior, x, y, pairs.weight[:, encoding.quantity_of_target])
         found = ev.one_step_table(result, blocks, encoding, target_std)
         found.append({"metric": "distinct_particles", "output": "joint", "unit": "1", "value": number})
         tables["predictions"].append(_predictions(seed, where, y, result, encoding))
