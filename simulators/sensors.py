@@ -160,7 +160,9 @@ def _read_delay(path: str, name: str, node: Mapping[str, Any]) -> float:
         )
     seconds = read_number(path, given)
     if seconds < 0:
-        raise ModelError(f"{path}: {seconds:g} s is negative; a value cannot be recorded before it is measured")
+        raise ModelError(
+            f"{path}: got {seconds:g} s; it is how late a value is recorded, 0 or more. Leave it out where none is"
+        )
     return seconds
 
 
