@@ -41,7 +41,8 @@ class Measurements:
             trained on and nothing judged. A single
             episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
-            at the simulator's dt and is estimated where absent.
+            at the simulator's dt and is estimated where absent, and then no less than step/sqrt(12) of a sensor that is
+            quantised more coarsely than its noise.
         noise: `{law: gaussian}`, or `student_t` with degrees of freedom that are learned per output, for measurements of which
             some lie far off; `auto`: what the training rows say, by their leave-one-out log score.
         resample: s; bring the rows to this dt (the simulator's) with an anti-aliasing filter.

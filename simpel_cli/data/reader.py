@@ -145,7 +145,7 @@ def _trajectories(
         episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
-    noise = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
+    noise, steps = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
     gain = 1.0
     if config.resample is not None:
         episodes, gain, check = resample(
@@ -157,7 +157,7 @@ def _trajectories(
         speed: noise[position] * factor for speed, (position, factor) in of_slope.items() if position in noise
     }
     kept, short = _long_enough(config, model, episodes)
-    report += [short, _noise_check(config, model, noise)]
+    report += [short, _noise_check(config, model, noise, steps)]
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report, computed
 
 
@@ -269,29 +269,44 @@ def _long_enough(config: Measurements, model: Source, episodes: tuple[Episode, .
     return kept, Check("length", short == 0, detail)
 
 
-def _noise(config: Measurements, model: Source, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
-    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter."""
+def _noise(
+    config: Measurements, model: Source, mapping: Mapping, train: list[Episode]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter.
+
+    Third differences of values that repeat say almost nothing: an estimate is at least step/sqrt(12), the error of rounding.
+
+    Returns:
+        The noise, and the steps that it comes from where it does.
+    """
     names = [q.name for q in model.states] + list(mapping.outputs)
-    std = {}
+    std, steps = {}, {}
     for i, name in enumerate(names):
         if name not in mapping.columns:
             continue
         value = config.noise_std.get(name)
         if value is None:
             columns = [np.concatenate([episode.states, episode.outputs], axis=1)[:, i] for episode in train]
+            step = sensors.coarse_step([column[np.isfinite(column)] for column in columns])
             value = third_difference_std(columns)
+            if step / 12**0.5 > value:
+                value = step / 12**0.5
+                steps[name] = step
         if np.isfinite(value):
             std[name] = float(value)
-    return std
+    return std, steps
 
 
-def _noise_check(config: Measurements, model: Source, noise: dict[str, float]) -> Check:
+def _noise_check(config: Measurements, model: Source, noise: dict[str, float], steps: dict[str, float]) -> Check:
     units = {q.name: q.unit for q in (*model.states, *model.outputs)}
-    shown = [
-        f"{name} {config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
-        + (" (declared)" if name in config.noise_std else "")
-        for name, std in noise.items()
-    ]
+
+    def said(name: str, std: float) -> str:
+        value = f"{config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
+        if name in config.noise_std:
+            return f"{name} {value} (declared)"
+        return f"{name} {value}" + (f" (rounding to steps of {steps[name]:.3g})" if name in steps else "")
+
+    shown = [said(name, std) for name, std in noise.items()]
     return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
 
 
