@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli.data.checks import clock, sensors, values
-from simpel_cli.data.checks.noise import third_difference_std
+from simpel_cli.data.checks.noise import runs, third_difference_std
+from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
 from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
@@ -85,6 +86,9 @@ def read(
         config, model, rows, table, mapping, joined, named_episodes(config, table, rows), partial=partial
     )
     report += [when] if when is not None else []
+    if config.sensor:
+        ends, rows = saturation(config, model, rows, mapping)
+        report.append(ends)
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
@@ -180,11 +184,9 @@ def _sensors(
         return values if together else values[np.isfinite(values)]
 
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
-    columns = {
-        q.name: [there(np.concatenate([s.states, s.outputs], axis=1)[:, i]) for s in segments]
-        for i, q in enumerate(observed)
-        if q.name in mapping.columns
-    }
+    measured = [(i, q.name) for i, q in enumerate(observed) if q.name in mapping.columns]
+    columns = {name: [there(_column(s, i)) for s in segments] for i, name in measured}
+    moving = {name: [part for s in segments for part in _moving(s, i, together)] for i, name in measured}
     units = {q.name: q.unit for q in observed}
     times = [segment.time for segment in segments]
     together &= all(segment.late is None for segment in segments)
@@ -196,12 +198,32 @@ def _sensors(
     ]
     found = [
         sensors.jitter(times, dt, model.dt if config.resample is None else None, as_they_are=partial),
-        sensors.stale(columns),
-        sensors.quantisation(columns, units),
+        sensors.stale(moving),
+        sensors.quantisation(moving, units),
         kinematics(motions),
         derived(motions, config.derived),
     ]
     return found, tuple(dict.fromkeys([*config.derived, *differences(motions)]))
+
+
+def _column(episode: Episode, i: int) -> np.ndarray:
+    """Values of a state, or behind them an output, (T,)."""
+    values: np.ndarray = np.concatenate([episode.states, episode.outputs], axis=1)[:, i]
+    return values
+
+
+def _inside(episode: Episode, i: int) -> np.ndarray:
+    """Values of a state or an output, NaN where they lie at an end of their sensor, (T,)."""
+    values = _column(episode, i)
+    return values if episode.beyond is None else np.where(episode.beyond[:, i] != 0, np.nan, values)
+
+
+def _moving(episode: Episode, i: int, together: bool) -> list[np.ndarray]:
+    """Pieces of a column between the values at an end of its sensor, which repeats those as it should."""
+    values = _inside(episode, i)
+    if not together:
+        return [values[np.isfinite(values)]]
+    return [values] if episode.beyond is None else runs(values)
 
 
 def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
@@ -219,6 +241,7 @@ def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, 
             inputs=rows.inputs[begin:end],
             outputs=rows.outputs[begin:end],
             late=_late(rows.take(np.arange(begin, end))),
+            beyond=_beyond(rows.take(np.arange(begin, end))),
         )
         segments.append((str(rows.split[begin]), segment))
     return segments
@@ -229,6 +252,11 @@ def _late(rows: Rows) -> np.ndarray | None:
     if not rows.late.shape[1]:
         return None
     return np.where(np.isfinite(np.concatenate([rows.states, rows.outputs], axis=1)), rows.late, 0.0)
+
+
+def _beyond(rows: Rows) -> np.ndarray | None:
+    """At which end of its sensor every value lies; None: none does."""
+    return rows.beyond if rows.beyond.any() else None
 
 
 def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[Episode, ...]:
@@ -244,7 +272,7 @@ def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[
     for name in dict.fromkeys(names.tolist()):
         own = names == name
         columns = (chosen.time[own], chosen.states[own], chosen.inputs[own], chosen.outputs[own], following[own])
-        episodes.append(Episode(str(name), *columns))
+        episodes.append(Episode(str(name), *columns, beyond=_beyond(chosen.take(own))))
     return tuple(episodes)
 
 
@@ -286,7 +314,7 @@ def _noise(
             continue
         value = config.noise_std.get(name)
         if value is None:
-            columns = [np.concatenate([episode.states, episode.outputs], axis=1)[:, i] for episode in train]
+            columns = [_inside(episode, i) for episode in train]
             step = sensors.coarse_step([column[np.isfinite(column)] for column in columns])
             value = third_difference_std(columns)
             if step / 12**0.5 > value:

@@ -28,6 +28,7 @@ class Rows(NamedTuple):
     late: (
         np.ndarray
     )  # (n, n_states + n_measured_outputs) s, how long before its row a value was measured; (n, 0): none was
+    beyond: np.ndarray  # (n, n_states + n_measured_outputs) -1, 1: at its sensor's low or high end, or beyond, else 0; (n, 0): none was declared
 
     def take(self, chosen: np.ndarray) -> "Rows":
         """Rows chosen by a mask or by indices."""
@@ -129,6 +130,7 @@ def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping)
         outputs=_stack(n, [_numbers(table, mapping, name) for name in mapping.outputs]),
         next_states=_stack(n, following),
         late=np.empty((n, 0)),
+        beyond=np.empty((n, 0)),
     ).take(order)
 
 
