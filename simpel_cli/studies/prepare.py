@@ -54,7 +54,7 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
     carried = (encoding.stack, encoding.linear)
     outputs = len(study.recording.outputs)
     pairs = transitions(recorded, *carried) if recorded else no_transitions(source, outputs, *carried)
-    alike = bool((pairs.weight == 1).all())
+    alike = bool((pairs.weight == 1).all()) and not pairs.beyond.any()
     training = [
         training_arrays(
             select(pairs, measurements.n_train, measurements.choice, measurements.seed_or(seed)), encoding, alike=alike
@@ -94,8 +94,9 @@ def training_arrays(pairs: Transitions, encoding: Encoding, *, alike: bool) -> T
     if alike:
         return Training(x, y)
     weight = pairs.weight[:, encoding.quantity_of_target]
-    # what was estimated by the simulator agrees with it: it tells nothing of the noise
-    return Training(x, y, weight, (weight == 1).astype(float))
+    beyond = pairs.beyond[:, encoding.quantity_of_target]
+    # what was estimated by the simulator agrees with it, and an end of a sensor is no value: they tell nothing of the noise
+    return Training(x, y, weight, ((weight == 1) & (beyond == 0)).astype(float), beyond)
 
 
 def _bound(method: Method, setting: Setting) -> Callable[[Problem], Inference]:

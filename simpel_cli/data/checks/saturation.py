@@ -50,9 +50,9 @@ def saturation(config: Measurements, model: Source, rows: Rows, mapping: Mapping
         cells[:, j] = np.where(beyond[:, j] < 0, low, np.where(beyond[:, j] > 0, high, cells[:, j]))
         if share and config.resample is not None:
             raise DataError(
-                f"data.resample: {share:.2%} of the values of {name} lie at an end of its sensor (data.sensor.{name}.saturates). "
-                "A filter would spread them over their neighbours. Set sim.dt to the time step of the data, and "
-                "data.resample: null."
+                f"data.resample: {share:.2%} of the values of {name} lie at an end of its sensor, "
+                f"data.sensor.{name}.saturates. A filter would spread them over their neighbours. Set sim.dt to the time step "
+                "of the data, and data.resample: null."
             )
         said.append(told)
     rows = rows._replace(
