@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from simpel_cli.data.sensor_keys import SENSOR, read_sensor
 from simpel_cli.data.timing.keys import JOIN, LATENCY, Join, read_join, read_latency, read_times
 from simpel_cli.errors import ConfigError, did_you_mean
 from simulators.expression import ExpressionError, symbols_used
@@ -16,6 +17,7 @@ NOISE = ("law", "scale")
 SPLIT_BY = ("episode", "time")
 OF_INPUTS = {  # what to do where one is named
     "latency": "only states and outputs are recorded late. One that acts late is sim.inputs.{0}.delay.",
+    "sensor": "only states and outputs have a sensor that saturates. What acts is its column: clip it there.",
     "times": "the times of inputs are those of the rows, data.time. Only states and outputs have clocks of their own.",
 }
 SPLIT_DEFAULT: dict[str, Any] = {"test_fraction": 0.25, "by": "episode"}
@@ -43,7 +45,8 @@ class Measurements:
             trained on and nothing judged. A single
             episode of a simulator without states is split by rows, drawn at random: none depends on another.
         noise_std: standard deviation of the measurement noise per state or output, in its unit; it describes the rows
-            at the simulator's dt and is estimated where absent.
+            at the simulator's dt and is estimated where absent, and then no less than step/sqrt(12) of a sensor that is
+            quantised more coarsely than its noise.
         noise: `{law: gaussian}`, or `student_t` with degrees of freedom that are learned per output, for measurements of which
             some lie far off; `auto`: what the training rows say, by their leave-one-out log score.
             `scale: {y: 0.01 + 0.05*abs(y)}`: how the scale of the noise of a measured state or output goes with the states,
@@ -71,6 +74,9 @@ class Measurements:
             after their `time` (s, on the same clock). `columns`: those that are taken; left out: all that `path` does not
             have. `episode`: column of the names that `data.episode` has, too; left out: the column of that name, or by time
             alone. Needs `time`; inputs come from `path`.
+        sensor: state or output -> `{saturates: [low, high]}`, what its sensor records at most, in its unit; null: no end. A
+            value at an end says that the quantity is there or beyond: of an output it is trained on and scored as that, of a
+            state it is a missing value, and so it is of both in `discover`.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
@@ -98,6 +104,7 @@ class Measurements:
     latency: Mapping[str, Any] = field(default_factory=dict)
     times: Mapping[str, str] = field(default_factory=dict)
     join: tuple[Mapping[str, Any], ...] = ()
+    sensor: Mapping[str, Any] = field(default_factory=dict)
 
     sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields whose type says too little
         "layout": {"enum": list(LAYOUTS)},
@@ -124,6 +131,7 @@ class Measurements:
         "between_rows": {"type": "object", "additionalProperties": {"enum": list(BETWEEN_ROWS)}},
         "latency": LATENCY,
         "join": JOIN,
+        "sensor": SENSOR,
     }
 
     def __post_init__(self) -> None:
@@ -151,6 +159,7 @@ class Measurements:
         _check_split(self.split)
         read_latency(self.latency)
         read_times(self.times, self.time)
+        read_sensor(self.sensor)
         _ = self.joined
         if self.layout == "transitions" and self.stack_actions:
             raise ConfigError(
@@ -180,6 +189,10 @@ class Measurements:
     def joined(self) -> tuple[Join, ...]:
         """The tables of other sensors."""
         return read_join(self.join, self.time)
+
+    def ends(self) -> dict[str, tuple[float, float]]:
+        """Return the lowest and the highest value that a sensor records, infinite where there is no end."""
+        return read_sensor(self.sensor)
 
     def known_latency(self) -> dict[str, float]:
         """Return how old the values of a column are when they are recorded, s, where it is a number."""
@@ -226,14 +239,14 @@ class Measurements:
             ("between_rows", self.between_rows, tuple(name for name in quantities if name not in measurable)),
             ("latency", self.latency, measurable),
             ("times", self.times, measurable),
+            ("sensor", self.sensor, measurable),
         ):
             for name in names:
                 if name not in allowed:
                     if key in OF_INPUTS and name in quantities:
                         raise ConfigError(f"data.{key}.{name}: {name} is an input; {OF_INPUTS[key].format(name)}")
-                    what = {"between_rows": "input", "latency": "state or output", "times": "state or output"}.get(
-                        key, "quantity"
-                    )
+                    of_sensors = dict.fromkeys(("latency", "times", "sensor"), "state or output")
+                    what = (of_sensors | {"between_rows": "input"}).get(key, "quantity")
                     raise ConfigError(
                         f"data.{key}.{name}: the simulator has no such {what} (it has: {', '.join(allowed)})."
                         + did_you_mean(name, list(allowed))

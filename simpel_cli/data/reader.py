@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli.data.checks import clock, sensors, values
-from simpel_cli.data.checks.noise import third_difference_std
+from simpel_cli.data.checks.noise import runs, third_difference_std
+from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
 from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
@@ -87,6 +88,9 @@ def read(
         ranges=not whole,
     )  # fmt: skip
     report += [when] if when is not None else []
+    if config.sensor:
+        ends, rows = saturation(config, model, rows, mapping)
+        report.append(ends)
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
@@ -148,7 +152,7 @@ def _trajectories(
         episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
-    noise = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
+    noise, steps = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
     gain = 1.0
     if config.resample is not None:
         episodes, gain, check = resample(
@@ -160,7 +164,7 @@ def _trajectories(
         speed: noise[position] * factor for speed, (position, factor) in of_slope.items() if position in noise
     }
     kept, short = _long_enough(config, model, episodes)
-    report += [short, _noise_check(config, model, noise)]
+    report += [short, _noise_check(config, model, noise, steps)]
     return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report, computed
 
 
@@ -183,11 +187,9 @@ def _sensors(
         return values if together else values[np.isfinite(values)]
 
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
-    columns = {
-        q.name: [there(np.concatenate([s.states, s.outputs], axis=1)[:, i]) for s in segments]
-        for i, q in enumerate(observed)
-        if q.name in mapping.columns
-    }
+    measured = [(i, q.name) for i, q in enumerate(observed) if q.name in mapping.columns]
+    columns = {name: [there(_column(s, i)) for s in segments] for i, name in measured}
+    moving = {name: [part for s in segments for part in _moving(s, i, together)] for i, name in measured}
     units = {q.name: q.unit for q in observed}
     times = [segment.time for segment in segments]
     together &= all(segment.late is None for segment in segments)
@@ -199,12 +201,32 @@ def _sensors(
     ]
     found = [
         sensors.jitter(times, dt, model.dt if config.resample is None else None, as_they_are=as_they_are),
-        sensors.stale(columns),
-        sensors.quantisation(columns, units),
+        sensors.stale(moving),
+        sensors.quantisation(moving, units),
         kinematics(motions),
         derived(motions, config.derived),
     ]
     return found, tuple(dict.fromkeys([*config.derived, *differences(motions)]))
+
+
+def _column(episode: Episode, i: int) -> np.ndarray:
+    """Values of a state, or behind them an output, (T,)."""
+    values: np.ndarray = np.concatenate([episode.states, episode.outputs], axis=1)[:, i]
+    return values
+
+
+def _inside(episode: Episode, i: int) -> np.ndarray:
+    """Values of a state or an output, NaN where they lie at an end of their sensor, (T,)."""
+    values = _column(episode, i)
+    return values if episode.beyond is None else np.where(episode.beyond[:, i] != 0, np.nan, values)
+
+
+def _moving(episode: Episode, i: int, together: bool) -> list[np.ndarray]:
+    """Pieces of a column between the values at an end of its sensor, which repeats those as it should."""
+    values = _inside(episode, i)
+    if not together:
+        return [values[np.isfinite(values)]]
+    return [values] if episode.beyond is None else runs(values)
 
 
 def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, Episode]]:
@@ -222,6 +244,7 @@ def _segments(model: Source, rows: Rows, starts: np.ndarray) -> list[tuple[str, 
             inputs=rows.inputs[begin:end],
             outputs=rows.outputs[begin:end],
             late=_late(rows.take(np.arange(begin, end))),
+            beyond=_beyond(rows.take(np.arange(begin, end))),
         )
         segments.append((str(rows.split[begin]), segment))
     return segments
@@ -232,6 +255,11 @@ def _late(rows: Rows) -> np.ndarray | None:
     if not rows.late.shape[1]:
         return None
     return np.where(np.isfinite(np.concatenate([rows.states, rows.outputs], axis=1)), rows.late, 0.0)
+
+
+def _beyond(rows: Rows) -> np.ndarray | None:
+    """At which end of its sensor every value lies; None: none does."""
+    return rows.beyond if rows.beyond.any() else None
 
 
 def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[Episode, ...]:
@@ -247,7 +275,7 @@ def _pairs(config: Measurements, model: Source, rows: Rows, part: str) -> tuple[
     for name in dict.fromkeys(names.tolist()):
         own = names == name
         columns = (chosen.time[own], chosen.states[own], chosen.inputs[own], chosen.outputs[own], following[own])
-        episodes.append(Episode(str(name), *columns))
+        episodes.append(Episode(str(name), *columns, beyond=_beyond(chosen.take(own))))
     return tuple(episodes)
 
 
@@ -272,29 +300,44 @@ def _long_enough(config: Measurements, model: Source, episodes: tuple[Episode, .
     return kept, Check("length", short == 0, detail)
 
 
-def _noise(config: Measurements, model: Source, mapping: Mapping, train: list[Episode]) -> dict[str, float]:
-    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter."""
+def _noise(
+    config: Measurements, model: Source, mapping: Mapping, train: list[Episode]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter.
+
+    Third differences of values that repeat say almost nothing: an estimate is at least step/sqrt(12), the error of rounding.
+
+    Returns:
+        The noise, and the steps that it comes from where it does.
+    """
     names = [q.name for q in model.states] + list(mapping.outputs)
-    std = {}
+    std, steps = {}, {}
     for i, name in enumerate(names):
         if name not in mapping.columns:
             continue
         value = config.noise_std.get(name)
         if value is None:
-            columns = [np.concatenate([episode.states, episode.outputs], axis=1)[:, i] for episode in train]
+            columns = [_inside(episode, i) for episode in train]
+            step = sensors.coarse_step([column[np.isfinite(column)] for column in columns])
             value = third_difference_std(columns)
+            if step / 12**0.5 > value:
+                value = step / 12**0.5
+                steps[name] = step
         if np.isfinite(value):
             std[name] = float(value)
-    return std
+    return std, steps
 
 
-def _noise_check(config: Measurements, model: Source, noise: dict[str, float]) -> Check:
+def _noise_check(config: Measurements, model: Source, noise: dict[str, float], steps: dict[str, float]) -> Check:
     units = {q.name: q.unit for q in (*model.states, *model.outputs)}
-    shown = [
-        f"{name} {config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
-        + (" (declared)" if name in config.noise_std else "")
-        for name, std in noise.items()
-    ]
+
+    def said(name: str, std: float) -> str:
+        value = f"{config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
+        if name in config.noise_std:
+            return f"{name} {value} (declared)"
+        return f"{name} {value}" + (f" (rounding to steps of {steps[name]:.3g})" if name in steps else "")
+
+    shown = [said(name, std) for name, std in noise.items()]
     return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
 
 

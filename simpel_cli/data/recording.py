@@ -38,6 +38,9 @@ class Episode(NamedTuple):
     # (T, n_states + n_measured_outputs) variance of a measured value over that of this one: 1 measured, less: estimated, of
     # states that were not measured in their row; None: every value was measured
     weight: np.ndarray | None = None
+    # (T, n_states + n_measured_outputs) -1, 1: the quantity lies at the low or high end of its sensor or beyond, else 0 (an
+    # output is the end itself there, a state NaN); None: no sensor was declared, or no value lies at an end
+    beyond: np.ndarray | None = None
 
 
 class Recording(NamedTuple):
@@ -68,6 +71,7 @@ class Transitions(NamedTuple):
     weight: (
         np.ndarray
     )  # (n, ds + dy_out) how much change and output count, 1 where they were measured (`Episode.weight`)
+    beyond: np.ndarray  # (n, ds + dy_out) of outputs `Episode.beyond`; of changes 0: a state at an end has no value
 
     def take(self, rows: np.ndarray) -> "Transitions":
         """Return some of them."""
@@ -114,8 +118,8 @@ def no_transitions(source: Source, outputs: int, stack_actions: int, linear: Seq
     width = (stack_actions + 1) * len(source.inputs) + len(linear)
     states, inputs = np.empty((0, len(source.states))), np.empty((0, width))
     nothing = np.empty(0, int)
-    weight = np.empty((0, len(source.states) + outputs))
-    return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing, weight)
+    every = np.empty((0, len(source.states) + outputs))
+    return Transitions(states, inputs, states, np.empty((0, outputs)), nothing, nothing, every, every)
 
 
 def _of_episode(index: int, episode: Episode, stack: int, linear: Sequence[int]) -> Transitions:
@@ -137,6 +141,7 @@ def _of_episode(index: int, episode: Episode, stack: int, linear: Sequence[int])
         episode=np.full(len(rows), index),
         row=rows,
         weight=_weight(episode, rows, n_states),
+        beyond=_beyond(episode, rows, n_states),
     )
 
 
@@ -149,6 +154,14 @@ def _weight(episode: Episode, rows: np.ndarray, n_states: int) -> np.ndarray:
         before, after = episode.weight[rows, :n_states], episode.weight[rows + 1, :n_states]
         change = 2 / (1 / before + 1 / after)
     return np.concatenate([change, episode.weight[rows, n_states:]], axis=1)
+
+
+def _beyond(episode: Episode, rows: np.ndarray, n_states: int) -> np.ndarray:
+    """At which end of its sensor an output lies; 0 of changes."""
+    found = np.zeros((len(rows), n_states + episode.outputs.shape[1]))
+    if episode.beyond is not None:
+        found[:, n_states:] = episode.beyond[rows, n_states:]
+    return found
 
 
 def select(pairs: Transitions, n_train: int | None, choice: str, seed: int) -> Transitions:

@@ -25,9 +25,11 @@ class Rows(NamedTuple):
     inputs: np.ndarray  # (n, n_inputs)
     outputs: np.ndarray  # (n, n_measured_outputs)
     next_states: np.ndarray  # (n, n_states) in layout transitions, else (n, 0)
-    late: (
-        np.ndarray
-    )  # (n, n_states + n_measured_outputs) s, how long before its row a value was measured; (n, 0): none was
+    # (n, n_states + n_measured_outputs) s, how long before its row a value was measured; (n, 0): none was
+    late: np.ndarray
+    # (n, n_states + n_measured_outputs) -1, 1: the quantity lies at its sensor's low or high end, or beyond, else 0; (n, 0): no
+    # sensor was declared
+    beyond: np.ndarray
 
     def take(self, chosen: np.ndarray) -> "Rows":
         """Rows chosen by a mask or by indices."""
@@ -129,6 +131,7 @@ def arrange(config: Measurements, model: Source, table: Table, mapping: Mapping)
         outputs=_stack(n, [_numbers(table, mapping, name) for name in mapping.outputs]),
         next_states=_stack(n, following),
         late=np.empty((n, 0)),
+        beyond=np.empty((n, 0)),
     ).take(order)
 
 

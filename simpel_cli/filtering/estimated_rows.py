@@ -198,7 +198,8 @@ def _made(
         if q.periodic:
             estimate[:, i] = _nearest_turn(estimate[:, i], values[:, i])
     if episode.late is not None:
-        values = values + _moved(episode, smoothed)
+        at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
+        values = values + np.where(at_an_end, 0.0, _moved(episode, smoothed))
     weight = np.full(values.shape, NOTHING)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight[:, :n_states] = np.minimum(typical[None] / variance, MOST_WEIGHT)

@@ -10,6 +10,7 @@ from jaxtyping import PRNGKeyArray
 
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.errors import ConfigError
+from simpel_cli.inference.censored import with_sites
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.protocols import (
     Bank,
@@ -85,8 +86,10 @@ def assemble(
     split = [jax.random.split(key) for key in keys]
     chooser = Chooser(prior, bound, system, normaliser, noise, noise_init)
     choices, gain = chosen(chooser, rows, [key for key, _ in split], law, kept_law)
+    # what lies at a sensor's end is no number: it takes its place by what the other rows say
+    rows = [with_sites(chooser, own, choice, key) for own, choice, (key, _) in zip(rows, choices, split, strict=True)]
     problems = []
-    for (x, y, relative, tells), (_, key), own in zip(rows, split, choices, strict=True):
+    for (x, y, relative, tells, _), (_, key), own in zip(rows, split, choices, strict=True):
         m, length = len(x), padded_length(max(len(x), 1))
         weights = multiplied(None if own.law is None else own.law.weights, relative)
         if m == 0:  # what pads must be simulable

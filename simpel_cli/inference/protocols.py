@@ -91,12 +91,15 @@ class Training(NamedTuple):
         y: targets, (m, dy).
         precision: how much each target counts, its noise has the variance sigma^2/precision, (m, dy); None: all alike.
         tells: 0 where a target says nothing of sigma, else 1, (m, dy); None: 1.
+        beyond: 1 or -1 where a target is the high or the low end of its sensor, and its quantity there or beyond, else 0,
+            (m, dy); None: none is. Such a target does not tell, and counts as `inference.censored` makes it.
     """
 
     x: np.ndarray
     y: np.ndarray
     precision: np.ndarray | None = None
     tells: np.ndarray | None = None
+    beyond: np.ndarray | None = None
 
     @property
     def silent(self) -> np.ndarray:

@@ -58,7 +58,7 @@ def prepare(study: Study, kept_law: str | None = None) -> Fitted:
     carried = (encoding.stack, encoding.linear)
     outputs = len(study.recording.outputs)
     pairs = transitions(recorded, *carried) if recorded else no_transitions(source, outputs, *carried)
-    alike = bool((pairs.weight == 1).all())
+    alike = bool((pairs.weight == 1).all()) and not pairs.beyond.any()
     # one normaliser for all seeds and all n_train: results stay comparable
     normaliser = normaliser_of(study.system, stream(0, "normaliser"))
     scale = noise_scale_of(measurements.noise_scale, encoding, _unmeasured(study))
@@ -141,8 +141,9 @@ def training_arrays(
         return Training(x, y)
     weight = pairs.weight[:, encoding.quantity_of_target]
     counts = multiplied(weight, None if relative is None else relative**-2)
-    # what was estimated by the simulator agrees with it: it tells nothing of the noise
-    return Training(x, y, counts, (weight == 1).astype(float))
+    beyond = pairs.beyond[:, encoding.quantity_of_target]
+    # what was estimated by the simulator agrees with it, and an end of a sensor is no value: they tell nothing of the noise
+    return Training(x, y, counts, ((weight == 1) & (beyond == 0)).astype(float), beyond)
 
 
 def _bound(method: Method, setting: Setting, scale: NoiseScale | None) -> Callable[[Problem], Inference]:

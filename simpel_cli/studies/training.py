@@ -71,7 +71,9 @@ def _kept(fitted: Fitted, state: Any) -> dict[str, Any]:
     Another version of JAX may draw another normaliser; networks that were trained in one are worth nothing in another.
     """
     problems = fitted.assembled.problems
-    drawn = {name: getattr(problems, name) for name in DRAWN}
+    # a target at a sensor's end is what draws of the prior made of it
+    names = DRAWN if problems.precision is None else (*DRAWN, "y", "precision")
+    drawn = {name: getattr(problems, name) for name in names}
     return {"state": state, "problem": {name: value for name, value in drawn.items() if value is not None}}
 
 

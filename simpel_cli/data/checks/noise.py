@@ -20,16 +20,16 @@ def third_difference_std(episodes: Sequence[np.ndarray]) -> float:
     Returns:
         In the quantity's unit; NaN where no episode has `MIN_ROWS` rows.
     """
-    runs = [run for signal in episodes for run in _runs(signal)]
+    pieces = [run for signal in episodes for run in runs(signal)]
     if not any(
-        len(run) >= MIN_ROWS for run in runs
+        len(run) >= MIN_ROWS for run in pieces
     ):  # a sensor that speaks now and then: its own values follow each other
-        runs = [signal[np.isfinite(signal)] for signal in episodes]
-    variances = [float(np.mean(np.diff(run, 3) ** 2)) / 20 for run in runs if len(run) >= MIN_ROWS]
+        pieces = [signal[np.isfinite(signal)] for signal in episodes]
+    variances = [float(np.mean(np.diff(run, 3) ** 2)) / 20 for run in pieces if len(run) >= MIN_ROWS]
     return float(np.sqrt(np.median(variances))) if variances else float("nan")
 
 
-def _runs(signal: np.ndarray) -> list[np.ndarray]:
+def runs(signal: np.ndarray) -> list[np.ndarray]:
     """Contiguous values of a signal between those that are missing."""
     gone = np.flatnonzero(~np.isfinite(signal))
     return [part[np.isfinite(part)] for part in np.split(signal, gone)] if len(gone) else [signal]

@@ -52,7 +52,7 @@ def quantisation(signals: Mapping[str, Sequence[np.ndarray]], units: Mapping[str
     """Find sensors whose steps are coarser than their noise.
 
     Rounding to steps of q adds an error of q/sqrt(12) that is not white where the quantity moves slowly. It is reported
-    where q > 2.5 sigma (third differences) and the column has fewer than `FEW_LEVELS` levels.
+    where `coarse_step` finds one.
 
     Args:
         signals: name -> contiguous pieces of its column, each (T,).
@@ -60,15 +60,30 @@ def quantisation(signals: Mapping[str, Sequence[np.ndarray]], units: Mapping[str
     """
     found = []
     for name, pieces in signals.items():
-        q = quantum(pieces)
-        span = max((float(np.ptp(piece)) for piece in pieces if len(piece)), default=0.0)
-        sigma = third_difference_std(pieces)
-        if np.isfinite(q) and np.isfinite(sigma) and q > COARSE * sigma and span < FEW_LEVELS * q:
+        q = coarse_step(pieces)
+        if np.isfinite(q):
             what = f"{name} is quantised in steps of {q:.3g} {units.get(name, '')}".rstrip()
-            found.append(f"{what} ({span / q + 1:.0f} levels), coarser than its noise")
+            found.append(f"{what} ({_span(pieces) / q + 1:.0f} levels), coarser than its noise")
     return Check(
         "quantisation", not found, "; ".join(found) if found else "no sensor is quantised more coarsely than its noise"
     )
+
+
+def coarse_step(pieces: Sequence[np.ndarray]) -> float:
+    """Return the step of a sensor that is coarser than its noise; NaN: it is not.
+
+    q > 2.5 sigma (third differences), and fewer than `FEW_LEVELS` levels.
+
+    Args:
+        pieces: contiguous rows, angles unwrapped, each (T,).
+    """
+    q, sigma = quantum(pieces), third_difference_std(pieces)
+    coarse = np.isfinite(q) and np.isfinite(sigma) and q > COARSE * sigma and _span(pieces) < FEW_LEVELS * q
+    return q if coarse else float("nan")
+
+
+def _span(pieces: Sequence[np.ndarray]) -> float:
+    return max((float(np.ptp(piece)) for piece in pieces if len(piece)), default=0.0)
 
 
 def jitter(times: Sequence[np.ndarray], dt: float, wanted: float | None, *, as_they_are: bool = False) -> Check:

@@ -39,7 +39,7 @@ class Cleaned(NamedTuple):
 
 
 def cleaned(recording: Recording, model: Model, declared_noise: Collection[str]) -> Cleaned:
-    """Take computed columns and lone values out.
+    """Take computed columns, values at the ends of sensors, and lone values out.
 
     Args:
         recording: as it was read.
@@ -49,7 +49,7 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     Raises:
         DataError: nothing is measured, or nothing but noise is.
     """
-    recording = without_computed(recording, model)
+    recording = without_ends(without_computed(recording, model))
     names = measured(recording, model)
     splits = {"train": list(recording.train), "test": list(recording.test)}
     refuse_noise(recording, model)
@@ -115,11 +115,26 @@ def without_computed(recording: Recording, model: Model) -> Recording:
         for c in recording.checks
     )
     kept = [recording.outputs.index(n) for n in outputs]
-    train, test = (
-        tuple(e._replace(outputs=e.outputs[:, kept]) for e in episodes)
-        for episodes in (recording.train, recording.test)
-    )
+    columns = [*range(len(model.states)), *(len(model.states) + k for k in kept)]
+
+    def narrowed(e: Episode) -> Episode:
+        late, weight, beyond = (None if a is None else a[:, columns] for a in (e.late, e.weight, e.beyond))
+        return e._replace(outputs=e.outputs[:, kept], late=late, weight=weight, beyond=beyond)
+
+    train, test = (tuple(map(narrowed, episodes)) for episodes in (recording.train, recording.test))
     return recording._replace(train=train, test=test, outputs=outputs, estimated=estimated, checks=checks)
+
+
+def without_ends(recording: Recording) -> Recording:
+    """Leave out values at the ends of their sensors: to a filter an inequality is no measurement."""
+
+    def within(e: Episode) -> Episode:
+        if e.beyond is None:
+            return e
+        return e._replace(outputs=np.where(e.beyond[:, e.states.shape[1] :] != 0, np.nan, e.outputs))
+
+    train, test = (tuple(map(within, episodes)) for episodes in (recording.train, recording.test))
+    return recording._replace(train=train, test=test)
 
 
 def refuse_noise(recording: Recording, model: Model) -> None:

@@ -19,7 +19,7 @@ LONGEST_TEST = 2048  # of a window on which free runs are judged
 
 
 class Windows(NamedTuple):
-    """W windows of T rows; a row that is padding or not measured does not count.
+    """W windows of T rows; a row that is padding, not measured, or at an end of its sensor does not count.
 
     Args:
         y: (W, T, ny) measurements, 0 where they do not count.
@@ -118,6 +118,9 @@ def windows_of(
             for n in measured
         ]
         y = np.stack(columns, axis=1)
+        if episode.beyond is not None:  # an inequality is no measurement
+            every = [*states, *outputs]
+            y = np.where(episode.beyond[:, [every.index(n) for n in measured]] != 0, np.nan, y)
         past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
         clock = _clock(episode, states, measured, outputs, dt) if clocked else np.zeros((len(y), 0))
         for begin in range(0, len(y), length):
