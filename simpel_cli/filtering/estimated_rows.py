@@ -90,7 +90,10 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
     typical = _typical(plan, noise, train)
     together = _measured_together(recording.test)
     made = [_made(plan, e, f, p, typical, kept=None) for e, f in zip(recording.train, train, strict=True)]
-    tested = [_made(plan, e, f, p, typical, kept=together) for e, f in zip(recording.test, test, strict=True)]
+    tested = [
+        _once_known(_made(plan, e, f, p, typical, kept=together), e, together)
+        for e, f in zip(recording.test, test, strict=True)
+    ]
     good, left = [[e for e in part if np.isfinite(e.states).all()] for part in (made, tested)]
     if not good:
         raise DataError(
@@ -213,6 +216,17 @@ def _made(
         late=None,
         weight=None if (weight == 1).all() else weight,
     )
+
+
+def _once_known(whole: Episode, measured: Episode, kept: np.ndarray) -> Episode:
+    """Return an episode to test on from the row on by which every state has been measured once.
+
+    Before that the filter knows no more than the range of a state, and an error ahead is that of the guess.
+    """
+    there = np.isfinite(measured.states) | ~kept[None, : measured.states.shape[1]]
+    known = np.flatnonzero(there.cumsum(axis=0).all(axis=1))
+    first = int(known[0]) if len(known) else 0
+    return type(whole)(whole.name, *(a if a is None else a[first:] for a in whole[1:]))  # type: ignore[arg-type]
 
 
 def _read(model: Model, states: np.ndarray, episode: Episode, p: np.ndarray, plan: Setup) -> np.ndarray:

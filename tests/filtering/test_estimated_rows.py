@@ -143,3 +143,14 @@ def test_an_angle_is_estimated_on_its_turn_and_a_missing_output_counts_nothing()
         np.testing.assert_array_equal(after.weight[missing, 1], NOTHING)
         np.testing.assert_allclose(after.outputs[missing, 0], np.cos(after.states[missing, 0]), atol=0.05)
         assert (after.weight[np.isnan(phi), 0] <= MOST_WEIGHT).all()
+
+
+def test_a_test_begins_where_every_state_has_been_measured(
+    seldom: tuple[Recording, Recording, list[np.ndarray]],
+) -> None:
+    given, _, _ = seldom
+    states = given.test[0].states.copy()
+    states[:6, 1] = np.nan
+    found = with_estimates(given._replace(test=(given.test[0]._replace(states=states),)), model(), ("s", "v"))
+    assert found.test[0].time[0] == pytest.approx(8 * DT)
+    assert len(found.train[0].time) == ROWS
