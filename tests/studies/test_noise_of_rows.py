@@ -156,6 +156,21 @@ def test_other_measurements_are_judged_with_the_noise_of_the_run(runs: Path) -> 
     assert "data.noise.scale: {'y': '1 + x'}, but the run was fitted with {'y': '0.05 + 0.2*abs(y)'}" in done.err
 
 
+@pytest.mark.parametrize(
+    "words", [("data.n_train=0",), ("data.path=[]", "data.split={test_fraction: 0}")], ids=["rows", "none"]
+)
+def test_of_no_data_typical_is_what_the_ranges_say(runs: Path, words: tuple[str, ...]) -> None:
+    name = f"prior{len(words)}"
+    done = fit(runs, name, "height", scaled("2 + z"), "data.noise_std={y: 0.5}", "prior=simulator_only", *words)
+    assert done.code == 0, done.err
+    done = simpel(runs, "evaluate", name, "--config-dir", "my", "data=height", f"hydra.run.dir=of_{name}")
+    assert done.code == 0, done.err
+    found = predictions(runs / f"of_{name}")
+    z = pd.read_csv(runs / "my" / "height.csv").z
+    noise = np.sqrt(found["std"] ** 2 - found.epistemic_std**2)
+    np.testing.assert_allclose(noise, 0.5 * (2 + z.to_numpy()[found.row]) / np.sqrt(4 + 1 / 3), rtol=0.02)
+
+
 def test_what_is_wrong_is_said_with_its_cure(runs: Path) -> None:
     for formula, code, message in (
         ("0.1*abs(yy)", 2, "data.noise.scale.y: unknown name 'yy'; known here: x, y, z, pi. Did you mean y?"),
