@@ -1,5 +1,6 @@
 """Readings whose noise goes with the row, in the filter: they count by it, and are not taken for heavy tails."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_heavy_tailed_readings import DT, NOISE, errors, fitted, model
@@ -48,7 +49,7 @@ def test_readings_count_by_their_noise() -> None:
     gain = len(s) * (np.log(np.sqrt(np.mean(s**2))) - np.mean(np.log(s)))
     assert gain > 100
     assert found.base.optimum.log_evidence - alike.base.optimum.log_evidence == pytest.approx(gain, rel=0.15)
-    r = plan.coordinates.physical(found.base.optimum.z)[1].r
+    r = plan.coordinates.physical(jnp.asarray(found.base.optimum.z))[1].r
     np.testing.assert_allclose(r[1], NOISE * np.sqrt(np.mean(s**2)), rtol=0.1)  # of a typical row
     off, sd = errors(plan, found)
     assert (np.abs(off) < 3.5 * sd).all()

@@ -128,9 +128,8 @@ def test_parameters_are_those_of_weighted_least_squares(folder: Path) -> None:
     assert abs((predictions(folder / "weighted")["mean"].to_numpy() / x).mean() - A) < 3 * spread["weighted"]
 
 
-@pytest.mark.parametrize("formula", ["7", "0.1 + 0*z"])
-def test_a_scale_that_is_the_same_in_every_row_changes_nothing(runs: Path, formula: str) -> None:
-    name = f"same{formula[0]}"
+def test_a_scale_that_is_the_same_in_every_row_changes_nothing(runs: Path) -> None:
+    name, formula = "same", "7"
     done = fit(runs, name, "height", scaled(formula))
     assert done.code == 0, done.err
     one, other = predictions(runs / name), predictions(runs / "without")
@@ -156,19 +155,29 @@ def test_other_measurements_are_judged_with_the_noise_of_the_run(runs: Path) -> 
     assert "data.noise.scale: {'y': '1 + x'}, but the run was fitted with {'y': '0.05 + 0.2*abs(y)'}" in done.err
 
 
-@pytest.mark.parametrize(
-    "words", [("data.n_train=0",), ("data.path=[]", "data.split={test_fraction: 0}")], ids=["rows", "none"]
-)
-def test_of_no_data_typical_is_what_the_ranges_say(runs: Path, words: tuple[str, ...]) -> None:
-    name = f"prior{len(words)}"
-    done = fit(runs, name, "height", scaled("2 + z"), "data.noise_std={y: 0.5}", "prior=simulator_only", *words)
+def test_of_no_training_rows_typical_is_that_of_the_measured_ones(runs: Path) -> None:
+    done = fit(runs, "prior", "height", scaled("2 + z"), "data.noise_std={y: 2}", "data.n_train=0")
     assert done.code == 0, done.err
-    done = simpel(runs, "evaluate", name, "--config-dir", "my", "data=height", f"hydra.run.dir=of_{name}")
-    assert done.code == 0, done.err
-    found = predictions(runs / f"of_{name}")
-    z = pd.read_csv(runs / "my" / "height.csv").z
+    found, z = predictions(runs / "prior"), pd.read_csv(runs / "my" / "height.csv").z.to_numpy()
     noise = np.sqrt(found["std"] ** 2 - found.epistemic_std**2)
-    np.testing.assert_allclose(noise, 0.5 * (2 + z.to_numpy()[found.row]) / np.sqrt(4 + 1 / 3), rtol=0.02)
+    train, test = z[: ROWS // 2], z[ROWS // 2 :]
+    np.testing.assert_allclose(noise, 2 * (2 + test) / np.sqrt(np.mean((2 + train) ** 2)), rtol=0.02)
+
+
+def test_of_no_data_typical_is_what_the_ranges_say(tmp_path: Path) -> None:
+    my = rig(tmp_path)
+    words = ("sim=cart", "data=rig", "data.path=[]", "data.noise_std={s: 0.01, v: 0.1}", "data.noise.scale={v: '1 + u**2'}",
+             "method=sysid", "method.steps=3", "method.starts=2", "method.particles=3", "run.figures=false", "run.quiet=true")  # fmt: skip
+    done = simpel(tmp_path, "fit", "--config-dir", "my", *words, "hydra.run.dir=run")
+    assert done.code == 0, done.err
+    done = simpel(tmp_path, "evaluate", "run", "--config-dir", "my", "data=rig", "hydra.run.dir=tested")
+    assert done.code == 0, done.err
+    found, table = predictions(tmp_path / "tested").query("output == 'v'"), pd.read_csv(my / "run.csv")
+    found = found.assign(episode=found.episode.astype(int), t=found.time.round(4))
+    u = found.merge(table, left_on=["episode", "t"], right_on=["run", "t"], how="left").volts.to_numpy()
+    noise = np.sqrt(found["std"] ** 2 - found.epistemic_std**2).to_numpy()
+    rms = np.sqrt(1 + 2 * 3 + 81 / 5)  # of 1 + u^2, u uniform between -3 and 3
+    np.testing.assert_allclose(noise, 0.1 * (1 + u**2) / rms, rtol=0.05)
 
 
 def test_what_is_wrong_is_said_with_its_cure(runs: Path) -> None:
