@@ -167,7 +167,8 @@ def test_of_no_training_rows_typical_is_that_of_the_measured_ones(runs: Path) ->
 def test_of_no_data_typical_is_what_the_ranges_say(tmp_path: Path) -> None:
     my = rig(tmp_path)
     words = ("sim=cart", "data=rig", "data.path=[]", "data.noise_std={s: 0.01, v: 0.1}", "data.noise.scale={v: '1 + u**2'}",
-             "method=sysid", "method.steps=3", "method.starts=2", "method.particles=3", "run.figures=false", "run.quiet=true")  # fmt: skip
+             "method=sysid", "method.steps=3", "method.starts=2", "method.particles=3", "run.figures=false",
+             "run.quiet=true")  # fmt: skip
     done = simpel(tmp_path, "fit", "--config-dir", "my", *words, "hydra.run.dir=run")
     assert done.code == 0, done.err
     done = simpel(tmp_path, "evaluate", "run", "--config-dir", "my", "data=rig", "hydra.run.dir=tested")
