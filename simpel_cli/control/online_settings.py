@@ -6,6 +6,7 @@ from simpel_cli.errors import ConfigError, check_at_least_one
 
 MEASURED = (
     "noise_std",
+    "noise",
     "stack_actions",
     "max_gap",
     "derived",

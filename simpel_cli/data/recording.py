@@ -36,7 +36,7 @@ class Episode(NamedTuple):
     next_states: np.ndarray | None = None  # (T, n_states) where rows do not follow each other (layout: transitions)
     late: np.ndarray | None = None  # (T, n_states + n_measured_outputs) s, how long before its row a value was measured
     # (T, n_states + n_measured_outputs) variance of a measured value over that of this one: 1 measured, less: estimated, of
-    # states that were not measured in their row; None: every value was measured
+    # states that were not measured in their row; in `discover` also by the declared scale of its noise; None: all alike
     weight: np.ndarray | None = None
     # (T, n_states + n_measured_outputs) -1, 1: the quantity lies at the low or high end of its sensor or beyond, else 0 (an
     # output is the end itself there, a state NaN); None: no sensor was declared, or no value lies at an end

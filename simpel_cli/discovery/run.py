@@ -42,12 +42,14 @@ from simpel_cli.discovery.verdict.groups import sentence_of as of_groups
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
+from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.errors import ConfigError, DataError, Inconclusive
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import members, setup, terms_of
+from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
 from simpel_cli.runs.files import write_table, write_text
@@ -161,7 +163,7 @@ def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str,
     def evidence(at: Mapping[str, float]) -> float:
         own = replace(measurements, latency=dict(measurements.latency) | dict(at))
         recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
-        recording = same_readings(recording, columns, at, longest, model.dt)
+        recording = _counted(same_readings(recording, columns, at, longest, model.dt), study)
         plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
         width = len(plan.augmented.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
         fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
@@ -170,6 +172,17 @@ def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str,
     found = estimated(evidence, ranges, model.dt)
     terminal.line(in_words_of_latency(found), "latency")
     return found
+
+
+def _counted(recording: Recording, study: Study) -> Recording:
+    """Return measurements whose values count by the scale of their noise, where `data.noise.scale` says it."""
+    source, formulas = study.system.source, dict(study.measurements.noise_scale)
+    computed = set(recording.derived) - set(study.recording.estimated)
+    formulas = {name: formula for name, formula in formulas.items() if name not in computed}  # no channels
+    measured = [*recording.outputs, *(q.name for q in source.states)]
+    unmeasured = [q.name for q in source.outputs if q.name not in measured]
+    scale = noise_scale_of(formulas, encoding_of(source, recording.outputs), [*study.recording.estimated, *unmeasured])
+    return recording if scale is None else scale.counted(recording)
 
 
 def _with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
@@ -188,6 +201,7 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
     declared_noise = tuple(study.measurements.noise_std)
     clean = cleaned(study.recording, model, declared_noise)
+    clean = clean._replace(recording=_counted(clean.recording, study))
     recording = clean.recording
     bad = [c for c in recording.checks if not c.ok]
     terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")

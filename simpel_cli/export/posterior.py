@@ -46,6 +46,8 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
     law = leaves.get("['problem']['tail']")
     noise = np.asarray(method.noise.std(rho, floor)) * scale["y_std"]
     arrays = scale | {"noise_std": noise if law is None else noise / np.sqrt(1 - 2 * law[index])}
+    if (typical := leaves.get("['problem']['noise_rms']")) is not None:
+        arrays["noise_rms"] = typical[index]
     count = sum(name.startswith(f"{root}.particles[") for name in leaves) // 2
     for i in range(count):
         arrays[f"kernel_{i}"] = leaves[f"{root}.particles[{i}][0]"][index]
@@ -66,7 +68,9 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
             {"name": name, "unit": unit, "kind": kind}
             for name, unit, kind in zip(encoding.y_names, encoding.y_units, encoding.y_kinds, strict=True)
         ],
-        "noise": "noise_std is a standard deviation; of Student's t the scale is noise_std*sqrt(1 - 2/degrees_of_freedom)",
+        "noise": "noise_std is a standard deviation, of a typical row where noise_scale says how it goes with the row (over "
+        "noise_rms, its typical value); of Student's t the scale is noise_std*sqrt(1 - 2/degrees_of_freedom)",
+        "noise_scale": {name: str(formula) for name, formula in declared.measurements.noise_scale.items()},
         "degrees_of_freedom": None if law is None else [float(1 / tail) for tail in law[index]],
         "networks": len(arrays["bias_0"]),
         "seed": declared.settings.all_seeds[index],

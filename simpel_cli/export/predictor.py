@@ -11,12 +11,50 @@ Arrays do as well, rows of states and of inputs in the order of posterior.json; 
 (`next_inputs`) act with their next value, too, which follows in the row.
 """
 
+import ast
 import json
+import operator
+from collections.abc import Callable
+from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from safetensors.numpy import load_file
+
+LEAST = 1e-3  # noise of a row over that of a typical one
+FUNCTIONS: dict[str, Callable[..., float]] = {
+    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign")},
+    **{"asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "abs": np.abs},
+    "min": lambda *terms: reduce(np.fmin, terms),
+    "max": lambda *terms: reduce(np.fmax, terms),
+    "where": lambda condition, a, b: a if condition != 0 else b,
+}
+OPERATORS: dict[type, Callable[..., float]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow,
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq,
+    ast.NotEq: operator.ne, ast.USub: operator.neg, ast.UAdd: operator.pos,
+}  # fmt: skip
+
+
+def value_of(node: ast.expr, known: dict[str, float]) -> float:
+    """Return the value of an expression, of which only plain arithmetic is evaluated; known: what its names stand for."""
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            return np.float64(value)
+        case ast.Name(id=name):
+            return np.float64(known[name] if name in known else {"pi": np.pi}[name])
+        case ast.BinOp(left=left, op=op, right=right):
+            return OPERATORS[type(op)](value_of(left, known), value_of(right, known))
+        case ast.UnaryOp(op=op, operand=operand):
+            return OPERATORS[type(op)](value_of(operand, known))
+        case ast.Compare(left=left, ops=ops, comparators=others):
+            pairs = pairwise(value_of(side, known) for side in (left, *others))
+            return np.float64(all(OPERATORS[type(op)](a, b) for op, (a, b) in zip(ops, pairs, strict=True)))
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return FUNCTIONS[name](*(value_of(argument, known) for argument in args))
+    raise ValueError(f"posterior.json: noise_scale holds {ast.unparse(node)}, which is no arithmetic")
 
 
 class Prediction(NamedTuple):
@@ -45,6 +83,9 @@ class Predictor:
         arrays = load_file(Path(folder) / "posterior.safetensors")
         self.scale = {name: arrays[name].astype(float) for name in ("x_mean", "x_std", "y_mean", "y_std")}
         self.noise_std = arrays["noise_std"].astype(float)
+        self.noise_rms = arrays.get("noise_rms", np.ones_like(self.noise_std)).astype(float)
+        shapes = self.facts.get("noise_scale") or {}
+        self.shapes = {name: ast.parse(" ".join(formula.split()), mode="eval").body for name, formula in shapes.items()}
         count = sum(name.startswith("kernel_") for name in arrays)
         self.layers = [(arrays[f"kernel_{i}"].astype(float), arrays[f"bias_{i}"].astype(float)) for i in range(count)]
         self.angle = [quantity["angle"] for quantity in self.facts["states"]]
@@ -130,7 +171,7 @@ class Predictor:
         after, outputs = self.advance(s, u)
         members = np.concatenate([after, outputs], axis=-1)[:, 0]
         mean, spread = members.mean(axis=0), members.var(axis=0)
-        noise = self._noise(s)
+        noise = self._noise(s, u)
         for i, angle in enumerate(self.angle):
             if angle:  # about the mean direction
                 mean[i] = np.arctan2(np.sin(members[:, i]).mean(), np.cos(members[:, i]).mean())
@@ -161,14 +202,44 @@ class Predictor:
             course.append(self.advance(course[-1], now[None])[0])
         return np.concatenate(course, axis=1)
 
-    def _noise(self, states: np.ndarray) -> np.ndarray:
+    def relative_noise(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Return the noise of every network output in one row over that of a typical one, (dy,).
+
+        Args:
+            states: (1, ds).
+            inputs: (1, (past_inputs + 1) du + next_inputs), oldest first.
+        """
+        if not self.shapes:
+            return np.ones_like(self.noise_std)
+        encoded, names = self.encode(states), [q["name"] for q in self.facts["inputs"]]
+        y = self.targets(np.concatenate([encoded, inputs], axis=-1)).mean(axis=0)
+        width, last = encoded.shape[-1], (self.facts["past_inputs"] + 1) * len(names)
+        now = inputs[0, last - len(names) : last]
+        later = now.copy()
+        later[[names.index(name) for name in self.facts["next_inputs"]]] = inputs[0, last:]
+        outputs, found = y[0, width:], []
+        before = self._shape(states[0], now, outputs)
+        after = self._shape(self.decode(encoded + y[:, :width])[0], later, outputs)
+        for name, angle in zip(self.names, self.angle, strict=False):  # a change is that of two measured values
+            found += [np.sqrt((before[name] ** 2 + after[name] ** 2) / 2)] * (2 if angle else 1)
+        found += [before[name] for name in self.names[len(self.angle) :]]
+        return np.maximum(np.array(found, float) / self.noise_rms, LEAST)
+
+    def _shape(self, states: np.ndarray, inputs: np.ndarray, outputs: np.ndarray) -> dict[str, float]:
+        """Return the declared scale of every state and output in one row; 1 where none is declared."""
+        names = [q["name"] for group in ("states", "inputs", "outputs") for q in self.facts[group]]
+        known = dict(zip(names, np.concatenate([states, inputs, outputs]), strict=True))
+        return {name: value_of(self.shapes[name], known) if name in self.shapes else 1.0 for name in self.names}
+
+    def _noise(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Return the noise of one measurement (ds + do,): of an angle, that across its direction."""
+        std = self.noise_std * self.relative_noise(states, inputs)
         noise, i = [], 0
         for j, angle in enumerate(self.angle):
             if angle:
                 sine, cosine = np.sin(states[0, j]), np.cos(states[0, j])
-                noise.append(float(np.hypot(cosine * self.noise_std[i], sine * self.noise_std[i + 1])))
+                noise.append(float(np.hypot(cosine * std[i], sine * std[i + 1])))
             else:
-                noise.append(float(self.noise_std[i]))
+                noise.append(float(std[i]))
             i += 2 if angle else 1
-        return np.array([*noise, *self.noise_std[i:]])
+        return np.array([*noise, *std[i:]])

@@ -94,6 +94,7 @@ def assemble(
         weights = multiplied(None if own.law is None else own.law.weights, relative)
         if m == 0:  # what pads must be simulable
             x, y = np.asarray(normaliser.x_mean)[None], np.zeros((1, encoding.dim_y))
+            relative, tells, weights = (None if a is None else np.ones(y.shape) for a in (relative, tells, weights))
         floors = own.noise if m <= chooser.most_rows else np.zeros_like(own.noise)
         arrays = Problem(
             x=pad_rows(x, length),

@@ -96,6 +96,8 @@ OF_OTHERS = [
     ("data", {"path": "a.csv", "layout": "rows"}),
     ("data", {"path": "a.csv", "n_train": "many"}),
     ("data", {"path": "a.csv", "noise_std": {"x": "small"}}),
+    ("data", {"path": "a.csv", "noise": {"scale": "abs(y)"}}),
+    ("data", {"path": "a.csv", "noise": {"scale": {"y": ["1"]}}}),
     ("reward", {"reward": "-x**2", "horizont": 3}),
     ("reward", {"horizon": 3}),
     ("reward", {"reward": "1", "initial": {"x": [0, 1, 2]}}),
@@ -149,6 +151,7 @@ def test_mistakes_are_refused(name: str, content: dict[str, Any]) -> None:
         ("sim", {"_target_": "my.package.Sim", "anything": 1}),  # of a package of the user's own
         ("data", {"path": "${simpel_shared:}/a.parquet", "n_train": "${oc.env:N}", "resample": "???", "seed": None}),
         ("data", {"path": ["a.csv", "b.csv"], "columns": {"x": None}, "noise_std": {"x": 1}, "split": {"column": "s"}}),
+        ("data", {"path": "a.csv", "noise": {"law": "gaussian", "scale": {"y": "0.01 + 0.05*abs(y)", "T": 1}}}),
         ("experiment", {"defaults": ["a", {"override /sim": "b"}, {"/sim@truth": "c"}, "_self_"], "close": True}),
         ("experiment", {"effect": {"x": {"parameters": {"a": {"range": [0, 1]}}}}, "hydra": {"run": {"dir": "x"}}}),
     ],

@@ -61,12 +61,13 @@ def heavy_tails(assessor: Assessor, z: np.ndarray, windows: Windows) -> np.ndarr
 
 def weighed(assessor: Assessor, z: np.ndarray, windows: Windows, tail: np.ndarray) -> Windows:
     """Return windows in which every value that counts does so by its weight; tail: 1/nu of every channel, (ny,)."""
+    alone = windows.ok  # how much a value counts by the scale of its noise
     for _ in range(ROUNDS):
         found = _residuals(assessor, z, windows)
         if found is None:
             break
-        weight = (1 + tail) / (1 + tail * np.nan_to_num(found.squared, nan=1.0))
-        windows = windows._replace(ok=np.where(windows.ok > 0, weight, 0.0))
+        weight = (1 + tail) / (1 + tail * np.where(np.isfinite(found.squared), found.squared * alone, 1.0))
+        windows = windows._replace(ok=np.where(alone > 0, alone * weight, 0.0))
     return windows
 
 

@@ -123,13 +123,17 @@ def windows_of(
             y = np.where(episode.beyond[:, [every.index(n) for n in measured]] != 0, np.nan, y)
         past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
         clock = _clock(episode, states, measured, outputs, dt) if clocked else np.zeros((len(y), 0))
+        weight = np.ones(y.shape)
+        if episode.weight is not None:
+            weight = episode.weight[:, [[*states, *outputs].index(name) for name in measured]]
         for begin in range(0, len(y), length):
             part = y[begin : begin + length]
             if len(part) < LEAST:
                 continue
             ok = np.isfinite(part)
             missing = length - len(part)
-            rows["ok"].append(np.pad(ok.astype(float), ((0, missing), (0, 0))))
+            counts = np.where(ok, weight[begin : begin + length], 0.0)
+            rows["ok"].append(np.pad(counts, ((0, missing), (0, 0))))
             rows["y"].append(np.pad(np.where(ok, part, 0.0), ((0, missing), (0, 0))))
             u = past[begin : begin + lead + len(part)]
             rows["u"].append(np.pad(np.nan_to_num(u), ((0, missing), (0, 0)), mode="edge"))
