@@ -51,7 +51,9 @@ def slope(run: Path) -> float:
     positions = {(str(row[0]), row[1]): row[2] for row in swing(8)}
     kept = found["output"] == "y"
     where = zip(found["episode"][kept], found["time"][kept], strict=True)
-    return float(np.polyfit([positions[str(episode), round(float(t), 4)] for episode, t in where], found["mean"][kept], 1)[0])
+    return float(
+        np.polyfit([positions[str(episode), round(float(t), 4)] for episode, t in where], found["mean"][kept], 1)[0]
+    )
 
 
 def of_y(run: Path, metric: str) -> float:
