@@ -37,7 +37,8 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.n
     """Compare one-step predictions with targets.
 
     The joint columns: NLL of the joint mixture; squared, absolute error and CRPS summed over outputs; coverage and
-    calibration of the Mahalanobis distance against chi-squared with dy degrees of freedom.
+    calibration of the Mahalanobis distance against chi-squared with dy degrees of freedom. A value at an end of its sensor has
+    the NLL and CRPS of the reading, and lies in the middle of the mass there or beyond.
 
     Args:
         posterior: the fitted posterior.
@@ -53,16 +54,18 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.n
 
 @jax.jit
 def _measure(p: Predictive, y: jax.Array) -> tuple[jax.Array, ...]:
-    inner = jnp.abs(2 * p.cdf(y) - 1)  # share of the mass that lies nearer to the median
+    pit, seen = p.pit(y), p.filled(y)
+    inner = jnp.abs(2 * pit - 1)  # share of the mass that lies nearer to the median
     # heavy tails have no chi-squared law: theirs is what a Gaussian of the same share would have
     r = (
-        ((y - p.mean) / p.std) ** 2
+        ((seen - p.mean) / p.std) ** 2
         if p.tail is None
         else jax.scipy.special.ndtri((1 + jnp.minimum(inner, 1 - 1e-12)) / 2) ** 2
     )
-    distance = p.mahalanobis(y) if p.tail is None else p.share_within(y)
+    distance = p.mahalanobis(seen) if p.tail is None else p.share_within(seen)
     columns = (
-        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), p.cdf(y), r, distance, p.mean, p.std, p.epistemic_std,
+        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), pit, r, distance, p.mean, p.reading(p.mean), p.std,
+        p.epistemic_std,
     )  # fmt: skip
     return columns
 
@@ -75,10 +78,10 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np
     if (precision != 1).any():
         p = p.counting(jnp.asarray(np.pad(precision, pad, mode="edge")))
     columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
-    nll, joint, crps, pit, r, distance, mean, std, epistemic = columns
+    nll, joint, crps, pit, r, distance, mean, read, std, epistemic = columns
     if p.tail is not None:  # a share of the mass: the distance that a Gaussian of the same share would have
         distance = chi_squared_quantile(distance, dy)
-    error = y - mean
+    error = y - read  # of a sensor that saturates: of what it would read of the mean
     quantiles = np.stack([chi_squared_quantile(LEVELS, 1)] * dy + [chi_squared_quantile(LEVELS, dy)])
     r_all = np.column_stack([r, distance])
     inside = np.column_stack([np.abs(pit - 0.5) <= 0.45, distance <= chi_squared_quantile(0.9, dy)])

@@ -159,6 +159,8 @@ def with_sites(chooser: Chooser, training: Training, chosen: Chosen, key: PRNGKe
             continue
         moments = chooser.moments(own, jax.random.fold_in(key, k))
         sigma = _noise(chooser, moments, chosen)
+        if chosen.law is not None:  # its scale holds the white model error, too
+            moments = moments._replace(white=0.0)
         weights = precision[share] if chosen.law is None else precision[share] * chosen.law.weights[share]
         for i in np.flatnonzero(own.beyond.any(axis=0)).tolist():
             found = sites(moments, i, own.beyond[:, i], chosen.gap[i], sigma[i], weights[:, i])

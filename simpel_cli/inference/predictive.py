@@ -1,6 +1,8 @@
 """The predictive distribution: an equal-weight mixture of one law of noise per particle.
 
 p(y | x) = 1/L sum_l prod_i p_i((y_i - h_li(x)) / sigma_i) / sigma_i,    p_i Gaussian or Student's t (`student_t`)
+
+Of a sensor that saturates a value at an end has the mass there or beyond in place of the density (`sensor_ends`).
 """
 
 from typing import NamedTuple
@@ -9,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.inference import student_t
+from simpel_cli.inference import sensor_ends, student_t
+from simpel_cli.inference.noise import Numbers
 
 
 class Predictive(NamedTuple):
@@ -20,11 +23,15 @@ class Predictive(NamedTuple):
         noise_scale: scale of the observation noise, shared by the particles: of a Gaussian its standard deviation. (dy,), the
             same in every row, or (n, dy), one of every row.
         tail: 1/nu of Student's t, positive; None: the noise is Gaussian.
+        limits: lowest and highest reading of every output's sensor, infinite where there is no end; None: no sensor saturates.
+            `log_prob`, `cdf`, `pit` and `crps` are those of the reading; mean, standard deviation and `mahalanobis` are those
+            of the quantity with its noise.
     """
 
     particles: Float[Array, "L n dy"]
     noise_scale: Float[Array, "*rows dy"]
     tail: Float[Array, " dy"] | None = None
+    limits: Float[Numbers, "dy 2"] | None = None
 
     @property
     def noise_std(self) -> Float[Array, "*rows dy"]:
@@ -66,11 +73,21 @@ class Predictive(NamedTuple):
 
     def log_prob(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Log density of the mixture, joint over outputs."""
-        return _mixture(jnp.sum(self._log_densities(y), axis=-1))
+        return _mixture(jnp.sum(self._log_readings(y), axis=-1))
 
     def log_prob_per_output(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Log density of each output's marginal mixture."""
-        return _mixture(self._log_densities(y))
+        return _mixture(self._log_readings(y))
+
+    def _log_readings(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
+        """Log density of what a sensor reads, at an end of it the log of the mass there or beyond."""
+        within = self._log_densities(y)
+        if self.limits is None:
+            return within
+        tail = None if self.tail is None else self.tail[None, None]
+        at_low, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
+        below, above = (sensor_ends.log_cdf(side * self._standardised(y), tail) for side in (1, -1))
+        return jnp.where(at_low[None], below, jnp.where(at_high[None], above, within))
 
     def _log_densities(self, y: Float[Array, "n dy"]) -> Float[Array, "L n dy"]:
         z = self._standardised(y)
@@ -82,10 +99,42 @@ class Predictive(NamedTuple):
         return (y[None] - self.particles) / self._scales[None]
 
     def cdf(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-        """Cumulative distribution of each output's mixture at y (the probability integral transform)."""
+        """Cumulative distribution of each output's reading at y; of the mixture itself, where no sensor saturates."""
+        found = self._cdf(y)
+        if self.limits is None:
+            return found
+        _, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
+        under = y < jnp.asarray(self.limits)[None, :, 0].astype(y.dtype)
+        return jnp.where(at_high, 1.0, jnp.where(under, 0.0, found))
+
+    def _cdf(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         z = self._standardised(y)
         below = jax.scipy.stats.norm.cdf(z) if self.tail is None else student_t.cdf(z, self.tail[None, None])
         return jnp.mean(below, axis=0)
+
+    def pit(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+        """Probability integral transform of y: `cdf`; at an end of a sensor the middle of the mass there or beyond."""
+        found = self._cdf(y)
+        if self.limits is None:
+            return found
+        at_low, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
+        return jnp.where(at_high, (1 + found) / 2, jnp.where(at_low, found / 2, found))
+
+    def filled(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+        """Return y with a value in the middle of the mass beyond, by a Gaussian, for one at an end of its sensor."""
+        if self.limits is None:
+            return y
+        at_low, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
+        least = 1e-12
+        middle = self.mean + self.std * jax.scipy.special.ndtri(jnp.clip(self.pit(y), least, 1 - least))
+        return jnp.where(at_low | at_high, middle, y)
+
+    def reading(self, value: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
+        """Return what sensors make of a value."""
+        if self.limits is None:
+            return value
+        low, high = jnp.asarray(self.limits).astype(value.dtype).T
+        return jnp.clip(value, low[None], high[None])
 
     def crps(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Continuous ranked probability score of each output, in its unit; lower is better.
@@ -111,7 +160,12 @@ class Predictive(NamedTuple):
             distance = student_t.expected_distance(self._standardised(y), self.tail[None, None])
             to_data = jnp.mean(distance, axis=0) * sigma
         between = jnp.mean(jax.lax.map(spread, self.particles), axis=0)
-        return to_data - 0.5 * between
+        found = to_data - 0.5 * between
+        if self.limits is None:
+            return found
+        limits, scale = jnp.asarray(self.limits), jnp.broadcast_to(jnp.asarray(self.noise_scale), y.shape)
+        clipped = sensor_ends.crps(self.particles, scale, self.tail, limits, y)
+        return jnp.where(jnp.isfinite(limits).any(axis=1)[None], clipped, found)
 
     def mahalanobis(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Squared Mahalanobis distance of y under the mixture's mean and covariance (chi-squared with dy if Gaussian)."""

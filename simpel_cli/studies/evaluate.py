@@ -62,7 +62,7 @@ def evaluate(job: Job, screen: Screen) -> None:
         manifest.facts |= {"run": str(run), "step": step, "device": str(study.device)}
         terminal = Terminal(study.settings.quiet, directory / "run.log")
         screen.describe_evaluation(terminal, run, step, study, judged_on)
-        judged = judge(judged_on, posteriors(study, fitted, state), fitted.target_std, directory, step)
+        judged = judge(judged_on, posteriors(study, fitted, state, judged_on), fitted.target_std, directory, step)
         constants = judged_on.constants | {"run": directory.name, "command": "evaluate", "n_train": fitted.n_train}
         write_metrics(directory / "metrics.parquet", judged.rows, constants)
         screen.publish(terminal, study, fitted, judged_on, judged, manifest)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from simpel_cli.data import Transitions, no_transitions, select, transitions
+from simpel_cli.data import Measurements, Transitions, no_transitions, select, transitions
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference.assemble import Assembled, assemble
@@ -156,18 +156,35 @@ def _bound(method: Method, setting: Setting, scale: NoiseScale | None) -> Callab
     return bind
 
 
-def posteriors(study: Study, fitted: Fitted, state: Any) -> list[Posterior]:
-    """Return the posterior of every seed as functions of arrays in data units."""
+def limits_of(measurements: Measurements, encoding: Encoding) -> np.ndarray | None:
+    """Return the lowest and highest reading of every target, (dy, 2), of outputs whose sensor saturates; None: none does."""
+    ends = measurements.ends()
+    limits = np.tile([-np.inf, np.inf], (encoding.dim_y, 1))
+    for i, q in enumerate(encoding.outputs, encoding.dim_state):
+        limits[i] = ends.get(q.name, limits[i])
+    return limits if np.isfinite(limits).any() else None
+
+
+def posteriors(study: Study, fitted: Fitted, state: Any, tested: Study | None = None) -> list[Posterior]:
+    """Return the posterior of every seed as functions of arrays in data units.
+
+    Args:
+        study: what was fitted.
+        fitted: its problems.
+        state: of the rule.
+        tested: whose sensors predictions are of; None: those of the study.
+    """
     bind, assembled = fitted.bind, fitted.assembled
     predict = jax.jit(lambda problem, state, x: bind(problem).predict(state, x))
     members = jax.jit(lambda problem, state, x: bind(problem).members(state, x))
     typical = jax.jit(lambda problem, state, x: study.method.bind(assembled.setting, problem).predict(state, x))
     dtype, scale = assembled.problems.x.dtype, fitted.scale
+    limits = limits_of((tested or study).measurements, study.system.encoding)
 
     def of_seed(i: int) -> Posterior:
         problem, own = jax.tree.map(lambda a: a[i], (assembled.problems, state))
         found = Posterior(
-            predict=lambda x: predict(problem, own, jnp.asarray(x, dtype)),
+            predict=lambda x: predict(problem, own, jnp.asarray(x, dtype))._replace(limits=limits),
             members=lambda x: members(problem, own, jnp.asarray(x, dtype)),
             particles=study.method.particles,
         )
