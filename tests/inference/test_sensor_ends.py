@@ -109,7 +109,7 @@ def test_without_ends_nothing_changes(law: str) -> None:
 @pytest.mark.parametrize("law", TAILS)
 def test_a_right_predictive_covers_what_it_says(law: str) -> None:
     """Readings of a Gaussian whose ends cut off 40 %: coverage, calibration, and errors of the reading."""
-    n, tail = 4000, TAILS[law]
+    n, tail = 1024, TAILS[law]
     rng = np.random.default_rng(2)
     centre = rng.normal(size=(n, 1))
     noise = rng.normal(size=(n, 1)) if tail is None else rng.standard_t(1 / tail[0], size=(n, 1))
@@ -136,4 +136,4 @@ def test_a_right_predictive_covers_what_it_says(law: str) -> None:
         *limits[0],
     )
     crps = np.mean(np.abs(draws - y), axis=1) - 0.5 * np.mean(np.abs(draws[:, :100] - draws[:, 100:]), axis=1)
-    assert found.crps[:, 0].mean() == pytest.approx(crps.mean(), abs=0.003)
+    assert found.crps[:, 0].mean() == pytest.approx(crps.mean(), abs=0.006)
