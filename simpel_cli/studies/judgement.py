@@ -132,7 +132,7 @@ def _calibration(seed: int, result: ev.OneStep, encoding: Any) -> dict[str, np.n
 
 def _horizon(seed: int, run: ev.FreeRun, encoding: Any, dt: float) -> dict[str, np.ndarray]:
     """Root mean square error of free runs, and the spread that the posterior predicts, by horizon and state."""
-    rmse, claimed = (_root_mean(a, run.known) for a in (run.error, run.std))
+    rmse, claimed = _root_mean(run.error, run.known), np.sqrt((run.std**2).mean(axis=0))
     steps, ds = rmse.shape
     return {
         "seed": np.full(steps * ds, seed),

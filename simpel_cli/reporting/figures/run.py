@@ -189,7 +189,9 @@ def _horizon(path: Path) -> Any:
             label = (
                 (f"error (RMSE){_of_seeds(seed, seeds)}", "predicted standard deviation") if i == 0 else (None, None)
             )
-            axis.plot(table["horizon"][own], table["rmse"][own], color=COLOURS[1], alpha=alpha, label=label[0])
+            there = own & np.isfinite(table["rmse"])  # a slow sensor was not there at every time
+            mark = "-" if there.sum() == own.sum() else ".-"
+            axis.plot(table["horizon"][there], table["rmse"][there], mark, color=COLOURS[1], alpha=alpha, label=label[0])
             axis.plot(
                 table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1]
             )
@@ -223,7 +225,7 @@ def _example(path: Path) -> Any:
 
 def _median_run(runs: list[tuple[Any, ...]], table: dict[str, np.ndarray]) -> tuple[Any, ...]:
     """Return the run in the middle, by squared error relative to that of all runs, summed over outputs."""
-    squared = (table["mean"] - table["measured"]) ** 2
+    squared = np.nan_to_num((table["mean"] - table["measured"]) ** 2)  # where nothing was measured there is no error
     for output in distinct(table["output"]):
         own = table["output"] == output
         squared[own] /= max(squared[own].mean(), np.finfo(float).tiny)
