@@ -79,7 +79,9 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, list[float]]:
         metric, output = row["metric"], row.get("output", "")
         if metric in SHOWN and output == "joint":
             values.setdefault(metric, []).append(row["value"])
-        elif metric.startswith("free_run_rmse@") and not metric.endswith(("_low", "_high")):
+        elif (
+            metric.startswith("free_run_rmse@") and not metric.endswith(("_low", "_high")) and np.isfinite(row["value"])
+        ):
             values.setdefault(f"{metric} {output}", []).append(row["value"])
     return {k: [float(np.median(v)), float(np.min(v)), float(np.max(v))] for k, v in values.items()}
 

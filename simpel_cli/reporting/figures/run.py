@@ -191,7 +191,9 @@ def _horizon(path: Path) -> Any:
             )
             there = own & np.isfinite(table["rmse"])  # a slow sensor was not there at every time
             mark = "-" if there.sum() == own.sum() else ".-"
-            axis.plot(table["horizon"][there], table["rmse"][there], mark, color=COLOURS[1], alpha=alpha, label=label[0])
+            axis.plot(
+                table["horizon"][there], table["rmse"][there], mark, color=COLOURS[1], alpha=alpha, label=label[0]
+            )
             axis.plot(
                 table["horizon"][own], table["claimed_std"][own], "--", color=COLOURS[0], alpha=alpha, label=label[1]
             )
