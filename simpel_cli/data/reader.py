@@ -111,6 +111,8 @@ def read(
     for part, episodes in parts.items():
         if not episodes and not (part == "test" and config.all_train):
             raise DataError(f"too few rows: no usable {part} transition is left. " + _what_failed(report))
+    if partial:
+        _refuse_silent(mapping, [q.name for q in model.states], parts["train"])
     return Recording(
         train=parts["train"],
         test=parts["test"],
@@ -122,6 +124,18 @@ def read(
         derived=tuple(name for name in computed if name in mapping.columns),
         groups=groups,
     )
+
+
+def _refuse_silent(mapping: Mapping, states: list[str], train: tuple[Episode, ...]) -> None:
+    """Refuse a measured quantity without a value in all training episodes, of which nothing can be learned."""
+    for i, name in enumerate([*states, *mapping.outputs]):
+        if name not in mapping.columns:
+            continue
+        if not any(np.isfinite(np.concatenate([e.states, e.outputs], axis=1)[:, i]).any() for e in train):
+            raise DataError(
+                f"column '{mapping.columns[name]}' ({name}) has no value in any of {len(train)} training episodes. Say that it "
+                f"was not measured, data.columns: {{{name}: null}}, or split otherwise (data.split)."
+            )
 
 
 def _trajectories(

@@ -10,7 +10,7 @@ KEYS = ("saturates",)
 SENSOR: dict[str, Any] = {  # JSON schema
     "type": "object",
     "additionalProperties": {
-        "type": "object",
+        "type": ["object", "null"],
         "properties": {
             "saturates": {
                 "type": "array",
@@ -34,6 +34,8 @@ def read_sensor(given: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     found: dict[str, tuple[float, float]] = {}
     for name, node in given.items():
         path = f"data.sensor.{name}"
+        if node is None:  # how a sensor of the YAML is taken away on the command line
+            continue
         if not isinstance(node, Mapping):
             raise ConfigError(f"{path}: {node!r} is not allowed, only e.g. {{saturates: [0, 10]}}.")
         for key in node:

@@ -100,8 +100,9 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
             f"sim: the filter of {model.name} lost the measurements in all of {len(made)} episodes, so that nothing tells the "
             "values that are missing. Give rows in which everything was measured, or narrow sim.parameters."
         )
-    checks = (*recording.checks, _check(plan, recording, good, noise, typical, compared=not together.all()))
-    level_of = dict(zip(plan.augmented.measured, noise.tolist(), strict=True))
+    checks = (*recording.checks, _check(plan, recording, good, noise, typical, together))
+    level_of = {q.name: float(np.sqrt(v)) for q, v in zip(plan.augmented.model.states, typical, strict=True)}
+    level_of |= dict(zip(plan.augmented.measured, noise.tolist(), strict=True))
     level_of |= {name: std for name, std in recording.noise_std.items() if name in declared_noise}
     return recording._replace(
         train=tuple(good), test=tuple(left), checks=checks, noise_std=dict(recording.noise_std) | level_of
@@ -165,12 +166,13 @@ def _typical(plan: Setup, noise: np.ndarray, found: Sequence[_Found]) -> np.ndar
 def _measured_together(episodes: Sequence[Episode]) -> np.ndarray:
     """Return whether estimates are told apart from measurements when a posterior is tested, per column.
 
-    A column of which nothing was measured can only be compared with estimates; where no row has every other one, all are.
+    A column of which nothing was measured can only be compared with estimates; where no transition ends with every other state,
+    and begins with every other output, all are.
     """
     if not episodes:
         return np.ones(0, bool)
-    there = np.isfinite(np.concatenate([np.concatenate([e.states, e.outputs], axis=1) for e in episodes]))
-    apart = there.any(axis=0)
+    there = np.concatenate([np.isfinite(np.concatenate([e.states[1:], e.outputs[:-1]], axis=1)) for e in episodes])
+    apart = np.asarray(there.any(axis=0))
     return apart if there[:, apart].all(axis=1).any() else np.zeros(len(apart), bool)
 
 
@@ -265,10 +267,9 @@ def _check(
     made: Sequence[Episode],
     noise: np.ndarray,
     typical: np.ndarray,
-    *,
-    compared: bool,
+    together: np.ndarray,
 ) -> Check:
-    """Say what was estimated, and how well it is known."""
+    """Say what was estimated, how well it is known, and what scores compare with; together: of `_measured_together`."""
     model, told, shares = plan.augmented.model, [], []
     names = [*(q.name for q in model.states), *recording.outputs]
     units = {q.name: q.unit for q in (*model.states, *model.outputs)}
@@ -291,7 +292,9 @@ def _check(
     late = sum(int((e.late > 0).sum()) for e in (*recording.train, *recording.test) if e.late is not None)
     if late:
         told.append(f"{late} values moved to their rows by what the simulator does there")
-    what = "; ".join(told)
-    if compared:
-        what += "; test scores compare with estimates, too, since no row has every value"
-    return Check("estimated by the simulator's filter", max(shares, default=0.0) <= FEW and not compared, what)
+    blind = [name for name, apart in zip(names, together, strict=False) if not apart]
+    if len(blind) == len(names):
+        told.append("test scores compare with estimates, since no transition ends with every value")
+    elif blind:
+        told.append(f"test scores of {', '.join(blind)} compare with estimates: nothing measured it")
+    return Check("estimated by the simulator's filter", max(shares, default=0.0) <= FEW and not blind, "; ".join(told))

@@ -24,6 +24,7 @@ Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
 MOST_GROUPED = 2  # effects that differ between groups and act at once
+UNKNOWN_NOISE = 0.01  # of a channel's magnitude, where its noise begins if nothing tells it
 PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
 
 
@@ -102,7 +103,9 @@ def setup(
     if spare is not None and most_rows is not None:
         # whole episodes are held out where there are enough, and of very long records a part tells enough
         spare = None if len(np.unique(windows.episode)) >= LEAST_EPISODES else thinned(spare, MOST_SPARE * most_rows)[0]
-    noise_std = {name: max(recording.noise_std[name], 1e-9 * scales.size[name]) for name in measured}
+    # of a sensor that speaks seldom its values do not tell the noise: the calibration does
+    known = {name: recording.noise_std.get(name, UNKNOWN_NOISE * scales.size[name]) for name in measured}
+    noise_std = {name: max(known[name], 1e-9 * scales.size[name]) for name in measured}
     r = np.array(list(noise_std.values()))
     if substeps is None:
         substeps = substeps_needed(model, recording.train, noise_std, scales, augmented.neutral[: len(model.params)])

@@ -63,7 +63,9 @@ def site(mean: float, variance: float, end: float, side: float, sigma: float) ->
     return mean + side * total / pull, precision
 
 
-def propagated(mean: np.ndarray, covariance: np.ndarray, end: np.ndarray, side: np.ndarray, sigma: float) -> Sites:
+def propagated(
+    mean: np.ndarray, covariance: np.ndarray, end: np.ndarray, side: np.ndarray, sigma: np.ndarray | float
+) -> Sites:
     """Return the sites of rows whose function values depend on each other, by sweeps over them, one after another.
 
     All at once they would overshoot where many rows tell of one parameter.
@@ -73,9 +75,11 @@ def propagated(mean: np.ndarray, covariance: np.ndarray, end: np.ndarray, side: 
         covariance: (c, c).
         end: see `site`, (c,).
         side: see `site`, (c,).
-        sigma: noise.
+        sigma: noise, of every row, (c,), or of all.
     """
-    count, least = len(mean), LEAST / sigma**2
+    count = len(mean)
+    sigma = np.broadcast_to(np.asarray(sigma, float), (count,))
+    least = LEAST / sigma**2
     precision, shift = np.zeros(count), np.zeros(count)
     for _ in range(SWEEPS):
         own, spread = _posterior(mean, covariance, precision, shift)
@@ -85,7 +89,7 @@ def propagated(mean: np.ndarray, covariance: np.ndarray, end: np.ndarray, side: 
             if without <= 0:  # rounding: the row says all that is known of it
                 continue
             cavity = (own[j] / spread[j, j] - shift[j]) / without
-            target, new = site(cavity, 1 / without, float(end[j]), float(side[j]), sigma)
+            target, new = site(cavity, 1 / without, float(end[j]), float(side[j]), float(sigma[j]))
             more, push = new - precision[j], new * target - shift[j]
             column = spread[j].copy()
             share = 1 / (1 + more * column[j])
@@ -118,7 +122,7 @@ def sites(moments: Moments, i: int, beyond: np.ndarray, kappa: float, sigma: flo
         beyond: 1 at the high end, -1 at the low one, else 0, (m,).
         kappa: scale of the gap, normalised.
         sigma: noise, normalised.
-        weights: how much the other rows count, (m,).
+        weights: how much every row counts: its noise has the variance sigma^2/weight, (m,).
     """
     samples = moments.samples[:, :, i]
     covariance = np.atleast_2d(np.cov(samples, rowvar=False)) + kappa**2 * moments.correlation
@@ -130,7 +134,7 @@ def sites(moments: Moments, i: int, beyond: np.ndarray, kappa: float, sigma: flo
         reach = cho_solve(cho_factor(of_rest, lower=True), covariance[np.ix_(rest, at)])
         known = known + reach.T @ (moments.targets[rest, i] - mean[rest])
         among = among - covariance[np.ix_(at, rest)] @ reach
-    return propagated(known, (among + among.T) / 2, moments.targets[at, i], beyond[at], sigma)
+    return propagated(known, (among + among.T) / 2, moments.targets[at, i], beyond[at], sigma / np.sqrt(weights[at]))
 
 
 def with_sites(chooser: Chooser, training: Training, chosen: Chosen, key: PRNGKeyArray) -> Training:

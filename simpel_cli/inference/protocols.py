@@ -104,7 +104,7 @@ class Training(NamedTuple):
     @property
     def silent(self) -> np.ndarray:
         """Return the outputs of which too few targets tell of the noise, (dy,)."""
-        if self.tells is None:
+        if self.tells is None or len(self.y) == 0:
             return np.zeros(self.y.shape[1], bool)
         return np.asarray((self.tells > 0).sum(axis=0) < FEWEST)
 

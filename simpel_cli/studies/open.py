@@ -110,6 +110,8 @@ def _read(measurements: Measurements, source: Source, data_folder: Path, *, whol
     if not estimated_rows.enough(recording):  # a few rows calibrate no filter: those that are whole count
         return read(measurements, source, data_folder, 0)
     assert isinstance(source, Model)
+    if recording.groups:
+        source = grouped(source.base or source, recording.groups)
     return estimated_rows.with_estimates(recording, source, tuple(measurements.noise_std))
 
 

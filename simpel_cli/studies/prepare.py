@@ -13,7 +13,7 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation import Posterior, test_arrays
 from simpel_cli.inference.assemble import Assembled, assemble
 from simpel_cli.inference.noise_scale import LEAST, NoiseScale, noise_scale_of, with_noise_of_rows
-from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting, Training, multiplied
+from simpel_cli.inference.protocols import Inference, Method, Normaliser, Problem, Setting, Training
 from simpel_cli.inference.system import normaliser_of
 from simpel_cli.runs.settings import stream
 from simpel_cli.studies.open import Study
@@ -140,7 +140,9 @@ def training_arrays(
     if alike and relative is None:
         return Training(x, y)
     weight = pairs.weight[:, encoding.quantity_of_target]
-    counts = multiplied(weight, None if relative is None else relative**-2)
+    counts = weight
+    if relative is not None:  # what was estimated is known no better where a sensor is quiet
+        counts = weight * np.where(weight < 1, np.minimum(relative**-2, 1.0), relative**-2)
     beyond = pairs.beyond[:, encoding.quantity_of_target]
     # what was estimated by the simulator agrees with it, and an end of a sensor is no value: they tell nothing of the noise
     return Training(x, y, counts, ((weight == 1) & (beyond == 0)).astype(float), beyond)
