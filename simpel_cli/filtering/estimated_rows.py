@@ -209,6 +209,8 @@ def _made(
     with np.errstate(divide="ignore", invalid="ignore"):
         weight[:, :n_states] = np.minimum(typical[None] / variance, MOST_WEIGHT)
     weight = np.where(there, 1.0, weight)
+    # estimates are all there is of a state that nothing measures: they count alike, and its noise is learned from them
+    weight[:, [i for i, q in enumerate(model.states) if q.name not in plan.augmented.measured]] = 1.0
     if kept is not None:
         weight[:, ~kept] = 1.0
     filled = np.where(there, values, estimate)

@@ -117,3 +117,23 @@ def test_wrong_words_about_times_are_named(tmp_path: Path, words: str, code: int
     for fragment in fragments:
         assert fragment in done.err, done.err
     assert "Traceback" not in done.err
+
+
+def test_groups_and_speeds_that_are_missing(tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    table = [[*r[:3], r[3] if random.random() > 0.1 else "", r[4], f"rig{int(r[0]) % 2}"] for r in swing()]
+    rig(tmp_path, measurements=csv(table, "run,t,pos,vel,volts,rig"))
+    done = simpel(tmp_path, "fit", *OWN, *FEW, "+sim.parameters.m.per=rig", "hydra.run.dir=run")
+    assert done.code == 0, done.err
+    assert figures(tmp_path / "run")["rmse", "v"] < 0.01
+
+
+def test_a_sensor_without_a_value_is_named(tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
+    table = [[*r[:3], "" if r[0] < 6 and not (r[0] == 0 and r[1] == 0) else r[3], r[4]] for r in swing()]
+    table[0][3] = ""
+    rig(tmp_path, measurements=csv(table))
+    done = simpel(tmp_path, "fit", *OWN, *FEW)
+    assert done.code == DATA, done.err
+    assert "vel" in done.err
+    assert "null" in done.err

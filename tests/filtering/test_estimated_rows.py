@@ -154,3 +154,38 @@ def test_a_test_begins_where_every_state_has_been_measured(
     found = with_estimates(given._replace(test=(given.test[0]._replace(states=states),)), model(), ("s", "v"))
     assert found.test[0].time[0] == pytest.approx(8 * DT)
     assert len(found.train[0].time) == ROWS
+
+
+def test_a_sensor_whose_noise_nothing_tells_begins_with_a_guess(
+    seldom: tuple[Recording, Recording, list[np.ndarray]],
+) -> None:
+    given, _, _ = seldom
+    found = with_estimates(given._replace(noise_std={"s": NOISE}), model(), ("s",))
+    assert NOISE / 4 < found.noise_std["v"] < 3 * NOISE
+
+
+def test_of_what_nothing_measures_estimates_count_as_measurements_do() -> None:
+    made, _ = episodes()
+    random = np.random.default_rng(5)
+    blind = []
+    for e in made:
+        states = e.states.copy()
+        states[:, 1] = np.nan
+        states[random.random(len(states)) < 0.1, 0] = np.nan
+        states[0, 0] = e.states[0, 0]
+        blind.append(e._replace(states=states))
+    given = recorded(blind)._replace(estimated=("v",), noise_std={"s": NOISE})
+    found = with_estimates(given, model(), ("s",))
+    assert "test scores of v compare with estimates: nothing measured it" in found.checks[-1].detail
+    assert all(e.weight is None or (e.weight[:, 1] == 1).all() for e in (*found.train, *found.test))
+    assert any((e.weight[:, 0] < 1).any() for e in found.train if e.weight is not None)
+
+
+def test_values_are_told_from_estimates_where_a_transition_ends_with_all_of_them() -> None:
+    """States are needed at its end, outputs at its beginning."""
+    values = np.full((6, 2), np.nan)
+    values[2] = 1.0
+    slow = Episode("slow", np.arange(6.0), values[:, :1], np.zeros((6, 1)), values[:, 1:])
+    assert not estimated_rows._measured_together([slow]).any()
+    early = slow._replace(outputs=np.roll(values[:, 1:], -1, axis=0))
+    assert estimated_rows._measured_together([early]).all()

@@ -172,3 +172,14 @@ def test_rows_that_do_not_tell_keep_their_weight(law: str) -> None:
     lifted = np.asarray(made.y)[0, at, 0] * NORMALISER.y_std[0] + NORMALISER.y_mean[0]
     side = rows.beyond[at, 0]  # type: ignore[index]
     assert np.mean(side * (lifted - np.where(side > 0, HIGH, LOW)) > 0) > 0.9  # beyond the end
+
+
+def test_a_row_at_an_end_has_the_noise_of_its_own() -> None:
+    """Alone, it is the site of its own noise, whatever that of the others is."""
+    mean, covariance = np.array([0.5, 0.5]), np.diag([1.0, 1.0])
+    found = propagated(mean, covariance, np.ones(2), np.ones(2), np.array([0.5, 2.5]))
+    for j, sigma in enumerate((0.5, 2.5)):
+        target, precision = site(0.5, 1.0, 1.0, 1.0, sigma)
+        assert found.target[j] == pytest.approx(target, rel=1e-6)
+        assert found.variance[j] == pytest.approx(1 / precision, rel=1e-6)
+    assert found.variance[1] > 5 * found.variance[0]
