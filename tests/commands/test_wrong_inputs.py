@@ -255,11 +255,18 @@ def test_truncated_parquet(tmp_path: Path) -> None:
     assert "run.parquet is damaged, cut off or no Parquet file" in result.err
 
 
-def test_rows_with_nan_are_dropped_and_counted(tmp_path: Path) -> None:
-    rig(tmp_path, measurements=change(40, 2, "nan"))
-    result = simpel(tmp_path, *OWN[:-1], "run.quiet=false")
+def test_a_missing_input_costs_its_row_and_a_missing_state_itself(tmp_path: Path) -> None:
+    rig(tmp_path, measurements=change(40, 4, "nan"))
+    words = (*OWN[:-1], "run.quiet=false")
+    result = simpel(tmp_path, *words, "hydra.run.dir=input")
     assert result.code == 0, result.err
-    assert "1 of 180 rows dropped (NaN, inf or empty in pos)" in result.out
+    assert "1 of 180 rows dropped, whose time or inputs are not known" in result.out
+    (tmp_path / "my" / "run.csv").write_text(change(40, 2, "nan"))
+    result = simpel(tmp_path, *words, "hydra.run.dir=state")
+    assert result.code == 0, result.err
+    report = (tmp_path / "state" / "report.html").read_text()
+    assert "missing values, each of which costs itself only: 1 of pos" in report
+    assert "estimated by the simulator" in report
 
 
 def test_a_failed_start_leaves_its_directory_free(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from linear_plant import DT
 from scipy.stats import multivariate_normal
-from test_filter import DT
 from test_interactions import FRICTION, NOISE, ROWS
 
 from simpel_cli.data.recording import Check, Episode, Recording

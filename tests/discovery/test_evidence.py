@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_filter import LOAD, A, B, model, recording
+from linear_plant import LOAD, A, B, model, recording
 
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Stage, Trial

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_filter import DT, LOAD, model, recording
+from linear_plant import DT, LOAD, model, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions

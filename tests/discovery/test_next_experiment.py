@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from test_filter import DT, LOAD, ROWS, A, B, model, recording
+from linear_plant import DT, LOAD, ROWS, A, B, model, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.next_experiment.candidates import DRIVEN, FREE, Proposal, signal
