@@ -1,15 +1,14 @@
 """The filter against the exact Gaussian law of a linear system, and its derivatives against differences."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from filter_derivatives import check_derivatives
 from linear_plant import DT, LOAD, ROWS, A, B, model, recording
 from scipy.stats import multivariate_normal
 
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.trials import Search
-from simpel_cli.filtering.likelihood.filter import Moving
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import Setup, setup
@@ -130,37 +129,10 @@ def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float) ->
 
 def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:
     """Exactly in a noise, and in a parameter up to what a row's Jacobian bends within the row."""
-    coordinates = plan.coordinates
-    n_p, n_r, n_q = coordinates.sizes
-    y, ok, u, start, spread = (jnp.asarray(a[0]) for a in plan.windows[:5])
-    at = jnp.asarray(plan.start)
-    p, noise = coordinates.physical(at)
-    track, held = plan.rule.track(p, noise, y, ok, u, start, spread)
-
-    def louder(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return plan.rule.louder(coordinates.physical(z)[1], track, held, ok, spread)
-
-    def moved(z: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
-        p = coordinates.physical(z)[0]
-        moving = Moving(p, row, p[jnp.minimum(row, n_p - 1)])
-        return plan.rule.moved(moving, noise, track, held, y, ok, u, start, spread)
-
-    @jax.jit
-    def exactly(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        other, _ = plan.rule.track(*coordinates.physical(z), y, ok, u, start, spread)
-        return other.innovation, other.variance
-
+    n_p, at = plan.coordinates.sizes[0], jnp.asarray(plan.start)
+    track, moved, slope = check_derivatives(plan, tuple(jnp.asarray(a[0]) for a in plan.windows[:5]), 1e-6)
     for found, known in zip(moved(at, jnp.asarray(n_p)), (track.innovation, track.variance), strict=True):
         np.testing.assert_allclose(found, known, rtol=1e-12)
-    slope = jax.jit(lambda step, row: jax.jvp(lambda z: moved(z, row), (at,), (step,))[1])
-    for i in range(n_p + n_r + n_q):
-        step = jnp.zeros(len(at)).at[i].set(1.0)
-        found = slope(step, jnp.asarray(i)) if i < n_p else jax.jvp(louder, (at,), (step,))[1]
-        ends = exactly(at + 1e-5 * step), exactly(at - 1e-5 * step)
-        for ours, up, down, within in zip(found, *ends, (0.03, 0.3), strict=True):
-            difference = np.asarray(up - down) / 2e-5
-            within = within if i < n_p else 1e-6
-            np.testing.assert_allclose(ours, difference, rtol=1e-5, atol=1e-6 + within * np.abs(difference).max())
     for nothing in slope(jnp.zeros(len(at)).at[-1].set(1.0), jnp.asarray(n_p)):  # padding
         assert not nothing.any()
 

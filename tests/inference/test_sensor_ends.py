@@ -123,7 +123,7 @@ def test_a_right_predictive_covers_what_it_says(law: str) -> None:
         return Predictive(h, jnp.asarray([0.5]), None if tail is None else jnp.asarray(tail[:1]), limits)
 
     def members(x: np.ndarray) -> jax.Array:
-        raise NotImplementedError
+        raise AssertionError("one step ahead nobody asks for single members")
 
     found = one_step(Posterior(predict, members, 1), x, y)
     assert np.isfinite(found.nll).all()
