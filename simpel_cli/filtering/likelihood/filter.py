@@ -122,6 +122,12 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         pace = pace_of(u)
         return dt / substeps if pace is None else (dt / substeps * pace).reshape((1,) * axes + pace.shape)
 
+    def in_stages(stage: Callable[..., Any], carry: Any, u: Array) -> Any:
+        """Scan the stages of a substep; what is held is no datum of the scan."""
+        if len(u) == 1:
+            return jax.lax.scan(lambda carry, weights: stage(carry, (weights, u[0])), carry, stages)[0]
+        return jax.lax.scan(stage, carry, (stages, at_stages(u)))[0]
+
     def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
         """Return the state one row later, and the rate there."""
 
@@ -134,7 +140,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 slope = moving_rates(x + h * weights[0] * slope, u, given)
                 return (total + h * weights[1] * slope, slope), None
 
-            return jax.lax.scan(stage, (x, before), (stages, at_stages(u)))[0], None
+            return in_stages(stage, (x, before), u), None
 
         return jax.lax.scan(step, (x, jnp.zeros_like(x)), u)[0]
 
@@ -154,7 +160,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         def step(carry: Any, u: Array) -> tuple[Any, None]:
             x, phi, *_ = carry
-            end = jax.lax.scan(stage, (x, phi, x, phi, *nothing, nothing[1]), (stages, at_stages(u)))[0]
+            end = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
             return (end[2], end[3], end[4], end[6]), None
 
         return jax.lax.scan(step, (x, unit, *nothing), u)[0]
@@ -204,12 +210,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def of_row(half: Array, pace: Array | None) -> Array:
         return half if pace is None else half * pace[None, None]
 
-    def counts(weight: Array) -> Array:
-        return jnp.where(weight > 0, 1.0, 0.0)
-
-    def loud(r: Array, weight: Array) -> Array:
-        """Return the variance of a measurement of so much weight; 0: it does not count."""
-        return r**2 / jnp.where(weight > 0, weight, 1.0)
+    def counted(weight: Array) -> tuple[Array, Array]:
+        """Return whether measurements of so much weight count, 1 or 0, and by what their variance is larger."""
+        there = weight > 0
+        return jnp.where(there, 1.0, 0.0), 1 / jnp.where(there, weight, 1.0)
 
     def after(cov: Array, jacobian: Array, half: Array) -> Array:
         return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
@@ -222,7 +226,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
             x, cov, u_before, rate, rate_x, jumps, begin = carry
-            y_k, ok_k, u_k = data
+            y_k, (ok_k, larger), u_k = data
             predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0])
             # the sensor is read at the row: what arrived up to it is the last substep before
             h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps, early_of(u_k[0, 0]), begin)
@@ -233,9 +237,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             for j in range(ny):
                 c = slope[j]
                 reach = apart(product(cov, c[:, None])[:, 0])
-                s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
                 e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
-                gain = apart((counts(ok_k[j]) / s)[None] * reach)
+                gain = apart((ok_k[j] / s)[None] * reach)
                 errors.append(e)
                 variances.append(s)
                 gains.append(gain)
@@ -261,7 +265,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         first = u_sub[0, 0, 0]
         rate, rate_x = rates(start, first, p)
         begin = (start, of_start(spread), first, rate, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
-        return jax.lax.scan(row, begin, (y, ok, u_sub))[1]
+        return jax.lax.scan(row, begin, (y, counted(ok), u_sub))[1]
 
     def at_rest(u: Array, x: Array, rate: Array) -> tuple[Array, ...]:
         """Return what came before the first row: the same rate."""
@@ -280,7 +284,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
             x, cov, u_before, rate, jumps, begin = carry
-            y_k, ok_k, u_k, at_k, held_k = data
+            y_k, (ok_k, larger), u_k, at_k, held_k = data
             read, predicted, pace = moving_sensors(x, u_before, given), x, pace_of(u_k[0, 0])
             if (early := early_of(u_k[0, 0])) is not None:
                 read = read + jnp.sum(held_k.prompt * way_back(early, x, rate, begin), axis=1)
@@ -299,8 +303,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 c, gain, s = slope[j], held_k.gain[j], at_k.variance[j]
                 if small:
                     reach = product(cov, c[:, None])[:, 0]
-                    s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
-                    gain = (counts(ok_k[j]) / s)[None] * reach
+                    s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
+                    gain = (ok_k[j] / s)[None] * reach
                     cov = cov - gain[:, None] * reach[None]
                 e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
                 errors.append(e)
@@ -315,21 +319,21 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         first = u_sub[0, 0, 0]
         rate = moving_rates(start, first, given)
         begin = (start, of_start(spread), first, rate, no_jumps(ny, start), at_rest(first, start, rate))
-        return jax.lax.scan(row, begin, (y, ok, u_sub, at, held))[1]
+        return jax.lax.scan(row, begin, (y, counted(ok), u_sub, at, held))[1]
 
     def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
         half = halved(noise)
 
         def row(carry: tuple[Array, Array], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
             away, cov = carry  # away: from the state of `at`
-            e_k, gain, slope, jacobian, ok_k, pace = data
+            e_k, gain, slope, jacobian, (ok_k, larger), pace = data
             errors, variances = [], []
             for j in range(ny):
                 c = slope[j]
                 reach = product(cov, c[:, None])[:, 0]
-                s = product(c[None], reach[:, None])[0, 0] + loud(noise.r[j], ok_k[j])
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
                 e = e_k[j] - product(c[None], away[:, None])[0, 0]
-                own = (counts(ok_k[j]) / s)[None] * reach
+                own = (ok_k[j] / s)[None] * reach
                 errors.append(e)
                 variances.append(s)
                 away = away + own * e[None] - gain[j] * e_k[j][None]
@@ -337,7 +341,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             away = product(jacobian, away[:, None])[:, 0]
             return (away, after(cov, jacobian, of_row(half, pace))), (jnp.stack(errors), jnp.stack(variances))
 
-        data = (at.innovation, held.gain, at.slope, at.jacobian, ok, held.pace)
+        data = (at.innovation, held.gain, at.slope, at.jacobian, counted(ok), held.pace)
         return jax.lax.scan(row, (jnp.zeros_like(spread), of_start(spread)), data)[1]
 
     def plain_flow(p: Array, x: Array, u: Array) -> Array:
