@@ -19,13 +19,13 @@ from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.between_rows import (
     LINEAR,
     Preference,
+    asked_beside,
     in_words,
-    preferences,
+    saying,
     sentence_of,
-    settled,
     words_of,
 )
-from simpel_cli.discovery.search.calibration import calibrated, shortlisted, with_heavy_tails
+from simpel_cli.discovery.search.calibration import calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
@@ -206,33 +206,40 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     bad = [c for c in recording.checks if not c.ok]
     terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")
     attach = partial(
-        setup, model, recording, declared_noise, effects, options.substeps, pairs=options.pairs, most_rows=options.rows
-    )
+        setup, recording=recording, declared_noise=declared_noise, effects=effects, substeps=options.substeps,
+        pairs=options.pairs, most_rows=options.rows,
+    )  # fmt: skip
     rows = sum(len(e.time) for e in recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    plan = shortlisted(attach, terms_of(model, recording, effects, pairs=options.pairs), options, terminal)
+    terms = terms_of(model, recording, effects, pairs=options.pairs)
+    plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
     width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room + members(plan)
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
     assessor = Assessor(plan, options.horizon)
     found = calibrated(plan, fitter, assessor, clean, terminal)
     selection, gates = accepted(found.search, assessor, found.base, options, terminal)
-    again = preferences(found.search, selection.chosen) if selection.chosen.terms else found.between_rows
-    if words_of(again) != words_of(found.between_rows):
-        terminal.line(f"beside these effects {in_words(again)}: searching once more", "inputs")
-        plan = plan._replace(start=settled(found.search, again))
-        found = calibrated(plan, fitter, Assessor(plan, options.horizon), clean, terminal, again)
+    said, chosen = words_of(between_rows), selection.chosen
+    if said and chosen.terms:
+        between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
+    if words_of(between_rows) != said:
+        terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
+        plan = attach(saying(model, between_rows), kept=kept)
+        fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
+        assessor = Assessor(plan, options.horizon)
+        found = calibrated(plan, fitter, assessor, clean, terminal)
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     # beside what is left unexplained, no data tell whether tails are heavy
     heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
     if heavy is not None:
         found = heavy
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
-    search, windows, between_rows = found.search, found.test, again
+    search, windows = found.search, found.test
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)
-    selection, gates = with_interactions(levels, selection, gates, attach, options, terminal)
+    attach_said = partial(attach, saying(model, between_rows))
+    selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")

@@ -41,6 +41,7 @@ class Setup(NamedTuple):
     lead: int
     substeps: int
     clocked: bool  # rows follow their time stamps; else they are dt apart
+    optimum: np.ndarray | None = None  # (n,) unit coordinates of the simulator alone, where it was calibrated already
 
 
 def setup(
@@ -86,7 +87,7 @@ def setup(
     every = terms_of(model, recording, effects, pairs=pairs)
     added = {key_of(t) for t in extra}
     terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)]
-    terms += [*extra, *questions(model)]
+    terms += extra
     augmented = augment(model, terms, measured)
     # of all of them, so that windows do not depend on what is kept
     longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.parameters), default=0.0)

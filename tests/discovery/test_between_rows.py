@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.between_rows import in_words, preferences, settled
+from simpel_cli.discovery.search.between_rows import in_words, preferences, settled, words_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.likelihood.fit import Fitter
-from simpel_cli.filtering.setup import setup
+from simpel_cli.filtering.setup import questions, setup
 from simulators.model import Declared, Model
 from simulators.worlds.simulate import Simulate
 
@@ -39,12 +39,12 @@ def recording(seed: int, **truth: str) -> Recording:
 
 
 def asked(model: Model, data: Recording):
-    plan = setup(model, data, (), [], 2)
+    plan = setup(model, data, (), [], 2, extra=questions(model))
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=6)
     search = Search(plan, fitter)
     base = search.base()
     found = preferences(search, base)
-    return found, Search(plan._replace(start=settled(search, found)), fitter)
+    return found, Search(plan._replace(start=settled(search, words_of(found))), fitter)
 
 
 @pytest.mark.parametrize("truth", [{"u": "linear", "v": "linear"}, {"u": "linear"}, {"v": "linear"}, {}])

@@ -13,8 +13,9 @@ from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
 from simpel_cli.discovery.search.selection import Selection, cut, select
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.smaller import carried, names_of
 from simpel_cli.discovery.search.trials import Search
-from simpel_cli.discovery.search.unexplained.interactions import BASES, carried, names_of
+from simpel_cli.discovery.search.unexplained.interactions import BASES
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.verdict import verdict_of

@@ -2,17 +2,22 @@
 
 Both are the same program: an unknown share of the way, at 0 or at 1, which no fit moves. It is the first hypothesis of all:
 half a row's shift of an input looks like a delay, a lag or a spring. And it is asked again of the model that was chosen, since
-a missing effect may look like that shift.
+a missing effect may look like that shift. A share takes every stage of every step an input of its own: it is asked in a small
+program, and the whole one takes the answer as said.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.setup import Setup, key_of, questions
 from simulators.effects.term import BETWEEN_ROWS
+from simulators.model import Model
 
 HELD, LINEAR = "held", "linear"
 
@@ -33,6 +38,30 @@ class Preference(NamedTuple):
 def asked_inputs(search: Search) -> dict[int, str]:
     """Return the terms that ask, with their inputs."""
     return {i: t.acts_on for i, t in enumerate(search.terms) if t.kind == BETWEEN_ROWS}
+
+
+def saying(model: Model, found: dict[str, Preference]) -> Model:
+    """Return the simulator that says what was found."""
+    return replace(model, between_rows=model.between_rows | words_of(found))
+
+
+def asked_beside(
+    attach: Callable[..., Setup], model: Model, search: Search, chosen: Trial, side_by_side: int
+) -> dict[str, Preference]:
+    """Compare held and linear inputs beside the effects that were chosen.
+
+    Args:
+        attach: (model, kept, extra) -> the setup of a program with these terms alone.
+        model: as it was declared.
+        search: in which the model was chosen.
+        chosen: it.
+        side_by_side: fits that run side by side.
+    """
+    kept = frozenset(key_of(search.terms[t]) for t in chosen.terms)
+    plan = attach(model, kept=kept, extra=questions(model))._replace(windows=search.plan.windows)
+    small = small_search(plan, side_by_side, sum(len(search.all_rows(t)) for t in chosen.terms))
+    small.plan = plan._replace(start=settled(small, search.plan.augmented.model.between_rows))
+    return preferences(small, fitted_again(small, search, chosen))
 
 
 def preferences(search: Search, at: Trial) -> dict[str, Preference]:
@@ -76,11 +105,11 @@ def _flipped(
     return Hypothesis(z, search.free(at.terms), search.ones)
 
 
-def settled(search: Search, found: dict[str, Preference]) -> np.ndarray:
-    """Return `plan.start` with the shares that were found."""
+def settled(search: Search, words: Mapping[str, str]) -> np.ndarray:
+    """Return `plan.start` with the shares that follow from words: held or linear, by input."""
     start = search.plan.start.copy()
     for t, name in asked_inputs(search).items():
-        start[search.rows[t][0]] = float(found[name].word == LINEAR)
+        start[search.rows[t][0]] = float(words[name] == LINEAR)
     return start
 
 

@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.between_rows import Preference, in_words, preferences, settled
+from simpel_cli.discovery.search.between_rows import Preference, in_words, preferences, saying, settled, words_of
 from simpel_cli.discovery.search.heavy_tails import heavy_tails, weighed
 from simpel_cli.discovery.search.outliers import gated, without_new
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.shortlist import MOST_PARAMETERS, shortlist
+from simpel_cli.discovery.search.smaller import carried, small_search
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun, moved
@@ -17,38 +18,70 @@ from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.measurements.cleaning import Cleaned
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import Setup, key_of, test_windows
+from simpel_cli.filtering.setup import Key, Setup, key_of, questions, test_windows
+from simpel_cli.filtering.tracks import Tracks
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
+from simulators.model import Model
 
 MOST_CALIBRATIONS = 3  # with fewer outliers the noise is known better, and shows more of them
 
 
-def shortlisted(attach: Callable[..., Setup], terms: Sequence[Term], options: Discovery, terminal: Terminal) -> Setup:
-    """Return the setup with the terms that get a place in the program: all of them, or those worth a fit."""
+class Prepared(NamedTuple):
+    """What is settled before the whole program is compiled.
+
+    Args:
+        plan: with the terms that get a place in it: all of them, or those worth a fit.
+        kept: them; None: all.
+        between_rows: input -> what it does between rows, where neither simulator nor data say.
+    """
+
+    plan: Setup
+    kept: frozenset[Key] | None
+    between_rows: dict[str, Preference]
+
+
+def prepared(
+    attach: Callable[..., Setup], model: Model, terms: Sequence[Term], options: Discovery, terminal: Terminal
+) -> Prepared:
+    """Calibrate the simulator alone, where that tells what the whole program needs: what inputs do, which terms to try.
+
+    Args:
+        attach: (model, kept, extra) -> the setup of a program with these terms alone, or with all.
+        model: the simulator.
+        terms: all of them.
+        options: of the search.
+        terminal: takes lines that say what goes on.
+    """
     unknowns = sum(len(t.parameters) for t in terms)
-    if unknowns <= MOST_PARAMETERS:
-        return attach()
-    terminal.line(
-        f"{len(terms)} terms with {unknowns} unknowns: calibrating the simulator alone, to choose", "screening"
-    )
-    plan = attach(kept=frozenset())
-    width = len(plan.augmented.model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
-    search = Search(plan, fitter)
+    unsaid, many = questions(model), unknowns > MOST_PARAMETERS
+    if not unsaid and not many:
+        return Prepared(attach(model), None, {})
+    if many:
+        terminal.line(
+            f"{len(terms)} terms with {unknowns} unknowns: calibrating the simulator alone, to choose", "screening"
+        )
+    plan = attach(model, kept=frozenset(), extra=unsaid)
+    plan = plan._replace(windows=begun(Tracks(plan), plan.start, plan.windows))
+    search = small_search(plan, options.lanes, 1)
     base = search.base()
     found = preferences(search, base)
-    if (start := settled(search, found)).tolist() != plan.start.tolist():
-        search = Search(plan._replace(start=start), fitter)
+    start = settled(search, words_of(found))
+    if not np.array_equal(start, plan.start):  # nothing is judged beside the wrong inputs
+        plan = plan._replace(start=start)
+        search = Search(plan, search.fitter)
         base = search.base()
-    forces = Forces(plan.rule, plan.coordinates, plan.augmented.model.dt)
-    z = base.optimum.z
-    force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
-    kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
-    left = sum(len(t.parameters) for t in terms if key_of(t) in kept)
-    terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
-    whole = attach(kept=kept)
-    return whole._replace(start=settled(Search(whole, fitter), found))
+    z, kept = base.optimum.z, None
+    if found:
+        terminal.line(in_words(found), "inputs")
+    if many:
+        forces = Forces(plan.rule, plan.coordinates, model.dt)
+        force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
+        kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
+        left = sum(len(t.parameters) for t in terms if key_of(t) in kept)
+        terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
+    whole = attach(saying(model, found), kept=kept)
+    return Prepared(whole._replace(optimum=carried(plan, z, whole)), kept, found)
 
 
 class Calibrated(NamedTuple):
@@ -59,7 +92,6 @@ class Calibrated(NamedTuple):
         base: its fit.
         test: held-out windows.
         clean: the measurements, without what stands out.
-        between_rows: input -> what it does between rows, where neither simulator nor data say.
         degrees_of_freedom: measured channel -> nu, of those whose noise has heavy tails.
     """
 
@@ -67,18 +99,10 @@ class Calibrated(NamedTuple):
     base: Trial
     test: Windows
     clean: Cleaned
-    between_rows: dict[str, Preference]
     degrees_of_freedom: dict[str, float] = {}  # noqa: RUF012
 
 
-def calibrated(
-    plan: Setup,
-    fitter: Fitter,
-    assessor: Assessor,
-    clean: Cleaned,
-    terminal: Terminal,
-    between_rows: dict[str, Preference] | None = None,
-) -> Calibrated:
+def calibrated(plan: Setup, fitter: Fitter, assessor: Assessor, clean: Cleaned, terminal: Terminal) -> Calibrated:
     """Calibrate the simulator, and again as long as values stand out or hidden states turn out to begin elsewhere.
 
     Args:
@@ -87,7 +111,6 @@ def calibrated(
         assessor: of errors ahead.
         clean: measurements.
         terminal: takes lines that say what goes on.
-        between_rows: what inputs do there, if it is known; None: it is asked first.
     """
     recording, names = clean.recording, plan.augmented.measured
     raw = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
@@ -98,13 +121,6 @@ def calibrated(
     for _ in range(MOST_CALIBRATIONS):
         search = Search(plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), report)
         base = search.base()
-        if between_rows is None:
-            between_rows = preferences(search, base)
-            start = settled(search, between_rows)
-            if not np.array_equal(start, plan.start):  # nothing stands out beside the wrong inputs
-                plan = plan._replace(start=start)
-                search = Search(search.plan._replace(start=start), search.fitter, report)
-                base = search.base()
         z = base.optimum.z
         # where hidden states begin was guessed with parameters from the middle of their ranges
         again = {split: begun(assessor, z, raw[split]._replace(ok=windows.ok)) for split, windows in cut.items()}
@@ -116,10 +132,7 @@ def calibrated(
             break
     search.plan = search.plan._replace(spare=cut.get("spare"))
     report("calibrated")
-    assert between_rows is not None
-    if between_rows:
-        terminal.line(in_words(between_rows), "inputs")
-    return Calibrated(search, base, cut["test"], clean, between_rows)
+    return Calibrated(search, base, cut["test"], clean)
 
 
 def with_heavy_tails(found: Calibrated, assessor: Assessor, z: np.ndarray, terminal: Terminal) -> Calibrated | None:

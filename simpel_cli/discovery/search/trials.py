@@ -14,7 +14,6 @@ from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
-from simulators.effects.term import BETWEEN_ROWS
 from simulators.groups import slot_names, spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
@@ -76,8 +75,7 @@ class Search:
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
-        # terms that are no candidates: what an input does between rows is asked separately
-        self.banned = {t for t, term in enumerate(self.terms) if term.kind == BETWEEN_ROWS}
+        self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
@@ -138,11 +136,11 @@ class Search:
         return z
 
     def base(self) -> Trial:
-        """Calibrate the simulator as it is, from several starts."""
+        """Calibrate the simulator as it is, from several starts, or from where it came to already."""
         random = np.random.default_rng(0)
-        starts = [self.plan.start]
+        starts = [self.plan.start] if self.plan.optimum is None else [self.plan.optimum, self.plan.start]
         n = len(self.plan.augmented.model.params)
-        for _ in range(STARTS - 1):
+        for _ in range(STARTS - 1 if self.plan.optimum is None else 0):
             z = self.plan.start.copy()
             z[:n] = random.uniform(0.1, 0.9, n)
             starts.append(z)
@@ -150,7 +148,7 @@ class Search:
         if not any(np.isfinite(o.log_evidence) for o in found):
             raise DataError(
                 f"sim: no parameters within the ranges of {self.plan.augmented.model.name} gave the measurements a finite "
-                f"likelihood, in {STARTS} tries: its states run away or its rates are not finite. Simulate it from a "
+                f"likelihood, in {len(starts)} tries: its states run away or its rates are not finite. Simulate it from a "
                 "measured start (`simpel simulate`), narrow sim.parameters, or guard roots, logarithms and divisions "
                 "with max(., 1e-9)."
             )

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
-from simpel_cli.discovery.search.trials import ACCEPT, Search
+from simpel_cli.discovery.search.smaller import fitted_again, small_search
+from simpel_cli.discovery.search.trials import ACCEPT
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.unexplained.pair_screening import Promise, promised
 from simpel_cli.filtering.errors_ahead import Assessor
-from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 
@@ -69,22 +70,10 @@ def interaction(
     report("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
     kept = {key_of(search.terms[t]) for t in chosen.terms}
     plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows, spare=search.plan.spare)
-    _, n_r, n_q = plan.coordinates.sizes
     unknowns = sum(len(search.all_rows(t)) for t in chosen.terms) + max(len(t.parameters) for t in going)
-    small = Search(
-        plan,
-        Fitter(
-            plan.rule,
-            plan.coordinates,
-            plan.windows,
-            side_by_side=side_by_side,
-            width=len(model.params) + n_r + n_q + unknowns,
-        ),
-    )
-    names = [key_of(t) for t in small.terms]
-    own = tuple(names.index(key_of(search.terms[t])) for t in chosen.terms)
-    start = Hypothesis(carried(search.plan, chosen.optimum.z, plan), small.free(own), small.ones)
-    before = small.best(own, small.fitter([start]))
+    small = small_search(plan, side_by_side, unknowns)
+    before = fitted_again(small, search, chosen)
+    own, names = before.terms, [key_of(t) for t in small.terms]
     trials = small.add(before, [names.index(key_of(t)) for t in going]).trials
     search.tried += len(going)
     if not trials:
@@ -120,23 +109,3 @@ def _worth_a_fit(promises: Sequence[Promise], terms: Sequence[Term], least: floa
 def sized(term: Term, size: float) -> Term:
     """Return a function with that share of the standard deviations of its weights."""
     return term._replace(parameters=tuple(k._replace(low=size * k.low, high=size * k.high) for k in term.parameters))
-
-
-def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:
-    """Carry unit coordinates from one setup to another, by the names of parameters, channels and driven states."""
-    values = {name: old.coordinates.value(i, float(z[i])) for i, name in enumerate(names_of(old))}
-    start = new.start.copy()
-    for i, name in enumerate(names_of(new)):
-        if name in values:
-            start[i] = new.coordinates.unit(i, values[name])
-    return start
-
-
-def names_of(plan: Setup) -> list[str]:
-    """Return a name for every unknown of a setup."""
-    states = [q.name for q in plan.augmented.model.states]
-    return [
-        *(q.name for q in plan.augmented.params),
-        *(f"noise of {name}" for name in plan.augmented.measured),
-        *(f"process noise of {states[i]}" for i in plan.coordinates.driven),
-    ]

@@ -1,0 +1,41 @@
+"""Programs with few terms or none beside the whole one: they compile and run in a fraction of its time."""
+
+import numpy as np
+
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.setup import Setup, key_of
+
+
+def small_search(plan: Setup, side_by_side: int, room: int) -> Search:
+    """Return a search with room for so many unknowns beside those of the simulator and the noise."""
+    width = len(plan.augmented.model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + room
+    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=side_by_side, width=width))
+
+
+def fitted_again(small: Search, search: Search, chosen: Trial) -> Trial:
+    """Fit the terms that were chosen in one search in the smaller program of another, in the same order."""
+    names = [key_of(t) for t in small.terms]
+    own = tuple(names.index(key_of(search.terms[t])) for t in chosen.terms)
+    start = Hypothesis(carried(search.plan, chosen.optimum.z, small.plan), small.free(own), small.ones)
+    return small.best(own, small.fitter([start]))
+
+
+def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:
+    """Carry unit coordinates from one setup to another, by the names of parameters, channels and driven states."""
+    values = {name: old.coordinates.value(i, float(z[i])) for i, name in enumerate(names_of(old))}
+    start = new.start.copy()
+    for i, name in enumerate(names_of(new)):
+        if name in values:
+            start[i] = new.coordinates.unit(i, values[name])
+    return start
+
+
+def names_of(plan: Setup) -> list[str]:
+    """Return a name for every unknown of a setup."""
+    states = [q.name for q in plan.augmented.model.states]
+    return [
+        *(q.name for q in plan.augmented.params),
+        *(f"noise of {name}" for name in plan.augmented.measured),
+        *(f"process noise of {states[i]}" for i in plan.coordinates.driven),
+    ]
