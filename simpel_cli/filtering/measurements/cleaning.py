@@ -134,7 +134,13 @@ def without_ends(recording: Recording) -> Recording:
         return e._replace(outputs=np.where(e.beyond[:, e.states.shape[1] :] != 0, np.nan, e.outputs))
 
     train, test = (tuple(map(within, episodes)) for episodes in (recording.train, recording.test))
-    return recording._replace(train=train, test=test)
+    if not any(e.beyond is not None and (e.beyond != 0).any() for e in (*recording.train, *recording.test)):
+        return recording._replace(train=train, test=test)
+    checks = tuple(
+        c._replace(detail=f"{c.detail}; discover leaves these values out") if c.name == "saturation" else c
+        for c in recording.checks
+    )
+    return recording._replace(train=train, test=test, checks=checks)
 
 
 def refuse_noise(recording: Recording, model: Model) -> None:
