@@ -85,6 +85,7 @@ def weighted_spectra(
     """
     if weights is None:
         return spectrum(correlation, residual, rows)
+    correlation = correlation.astype(jnp.float64)
     root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
     if tells is not None:
         root = root * jnp.asarray(tells).astype(jnp.float64).T
