@@ -1,7 +1,9 @@
 """From a data YAML and a simulator to a `Recording`: find, read, check, cut, estimate, resample."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,16 +22,37 @@ from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns, named_epis
 from simpel_cli.data.split import PARTS, assign
 from simpel_cli.data.tables.column_names import with_names_of_joined, with_short_names
 from simpel_cli.data.tables.locate import by_file, locate
-from simpel_cli.data.tables.table import read_table
+from simpel_cli.data.tables.table import Table, read_table
 from simpel_cli.data.time_gaps import cut_at_gaps
-from simpel_cli.data.timing.joined_tables import read_joined
+from simpel_cli.data.timing.joined_tables import Joined, read_joined
 from simpel_cli.data.timing.when_measured import refuse_unplaced, when_measured
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
 
 
+class _Tables(NamedTuple):
+    """What the files hold.
+
+    Args:
+        config: with the names that columns have in the tables.
+        table: of `data.path`.
+        joined: of other sensors.
+    """
+
+    config: Measurements
+    table: Table
+    joined: tuple[Joined, ...]
+
+
 def read(
-    config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True, partial: bool | None = None
+    config: Measurements,
+    model: Source,
+    base: Path,
+    seed: int,
+    *,
+    whole: bool = True,
+    partial: bool | None = None,
+    too_few: Callable[[Recording], bool] | None = None,
 ) -> Recording:
     """Read measurements for a simulator.
 
@@ -42,6 +65,8 @@ def read(
             stays NaN.
         partial: rows may lack values, and values may be measured before their row (`Episode.late`); None: unless `whole`. With
             `whole`, the filter is to estimate what is missing (`filtering.estimated_rows`): rows still have to be dt apart.
+        too_few: whether of partial rows there are too few to estimate what is missing, so that only whole rows count; None:
+            never.
 
     Returns:
         Checked episodes, at least one each to train and to test on, unless the data YAML keeps none to test on.
@@ -56,8 +81,8 @@ def read(
     if not config.paths:
         return Recording((), (), (), dict(config.noise_std), (), (), ())
     measurable = (*model.states, *model.outputs)
-    quantities = (*measurable, *model.inputs)
-    config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
+    names = tuple(q.name for q in measurable)
+    config.check_names((*names, *(q.name for q in model.inputs)), names)
     linear = model.linear if isinstance(model, Model) else ()
     if linear and config.layout == "transitions":
         name = model.inputs[linear[0]].name
@@ -66,12 +91,37 @@ def read(
             f"{key}.between_rows: {name} is linear, but the next value of an input is not known in layout 'transitions', whose "
             f"rows do not follow each other. Store trajectories, or set data.between_rows={{{name}: held}}."
         )
+    tables = _tables(config, model, base)
+    recording = _recorded(tables, model, known, base, seed, whole=whole, partial=partial)
+    if too_few is not None and too_few(recording):
+        return _recorded(tables, model, known, base, seed, whole=whole, partial=False)
+    return recording
+
+
+def _tables(config: Measurements, model: Source, base: Path) -> _Tables:
+    """Read the files."""
     found = [file for path in config.paths for file in locate(path, base)]
     table = read_table(tuple(file.path for file in found), [file.named for file in found])
     config = with_short_names(config, table, tuple(q.name for q in model.outputs))
     table = with_computed(table, config.computed)
     joined = read_joined(config, table, base)
     config = with_names_of_joined(config, [other.table for other in joined], table)
+    return _Tables(config, table, joined)
+
+
+def _recorded(
+    tables: _Tables,
+    model: Source,
+    known: dict[str, tuple[str, ...]],
+    base: Path,
+    seed: int,
+    *,
+    whole: bool,
+    partial: bool | None,
+) -> Recording:
+    """Check and cut what the files hold; known: the groups of a fit; others as of `read`."""
+    config, table, joined = tables
+    quantities = (*model.states, *model.outputs, *model.inputs)
     mapping = map_columns(config, model, table, joined)
     refuse_unplaced(config, model, mapping)
     dynamic = bool(model.states) and config.layout == "trajectories"

@@ -60,9 +60,9 @@ def whole(recording: Recording) -> bool:
     )
 
 
-def enough(recording: Recording) -> bool:
-    """Whether there are rows enough to calibrate a filter by."""
-    return sum(len(e.time) for e in recording.train) >= LEAST_ROWS
+def too_few(recording: Recording) -> bool:
+    """Whether values are missing and there are too few rows to calibrate a filter by."""
+    return not whole(recording) and sum(len(e.time) for e in recording.train) < LEAST_ROWS
 
 
 def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[str]) -> Recording:

@@ -104,11 +104,12 @@ def open_study(
 def _read(measurements: Measurements, source: Source, data_folder: Path, *, whole: bool) -> Recording:
     """Read measurements; where rows are needed whole and are not, the simulator's filter estimates what they lack."""
     fills = whole and isinstance(source, Model)
-    recording = read(measurements, source, data_folder, 0, whole=whole, partial=True if fills else None)
-    if not fills or estimated_rows.whole(recording):
+    if not fills:
+        return read(measurements, source, data_folder, 0, whole=whole)
+    # a few rows calibrate no filter: those that are whole count
+    recording = read(measurements, source, data_folder, 0, partial=True, too_few=estimated_rows.too_few)
+    if estimated_rows.whole(recording):
         return recording
-    if not estimated_rows.enough(recording):  # a few rows calibrate no filter: those that are whole count
-        return read(measurements, source, data_folder, 0)
     assert isinstance(source, Model)
     if recording.groups:
         source = grouped(source.base or source, recording.groups)
