@@ -123,6 +123,26 @@ def test_wrong_words_about_times_are_named(tmp_path: Path, words: str, code: int
     assert "Traceback" not in done.err
 
 
+def test_stamps_that_stray_by_a_fifth_of_a_row(tmp_path: Path) -> None:
+    """As they are, speeds would be off by about 0.03 m/s, three times the noise."""
+    my = rig(tmp_path)
+    made = simpel(
+        tmp_path, "simulate", "--config-dir", "my", "sim=cart", "simulation.episodes=6", "simulation.steps=40",
+        "simulation.noise_std={s: 0.001, v: 0.01}", "simulation.jitter=0.2",
+        "simulation.initial={s: [-0.3, 0.3], v: [-0.5, 0.5]}", "simulation.seed=3", "out=made",
+    )  # fmt: skip
+    assert made.code == 0, made.err
+    (my / "data" / "strayed.yaml").write_text(
+        "path: ../../made/measurements.parquet\ntime: t\nepisode: episode\nsplit: {column: split}\n"
+    )
+    done = simpel(tmp_path, "fit", "--config-dir", "my", "sim=cart", "data=strayed", *FEW, "hydra.run.dir=run")
+    assert done.code == 0, done.err
+    found = figures(tmp_path / "run")
+    assert found["rmse", "v"] < 0.02
+    assert found["rmse", "s"] < 0.002
+    assert "moved to even rows" in (tmp_path / "run" / "report.html").read_text()
+
+
 def test_few_rows_are_read_once_and_those_that_are_whole_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """27 training rows calibrate no filter."""
     table = [[*row[:3], "" if i % 10 == 5 else row[3], row[4]] for i, row in enumerate(swing(4, 9))]
