@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,37 +10,20 @@ from simpel_cli.data.checks import clock, sensors, values
 from simpel_cli.data.checks.noise import runs, third_difference_std
 from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
-from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
 from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
+from simpel_cli.data.files import Files, read_files
 from simpel_cli.data.groups import group_names, with_groups
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns, named_episodes
 from simpel_cli.data.split import PARTS, assign
-from simpel_cli.data.tables.column_names import with_names_of_joined, with_short_names
-from simpel_cli.data.tables.locate import by_file, locate
-from simpel_cli.data.tables.table import Table, read_table
+from simpel_cli.data.tables.locate import by_file
 from simpel_cli.data.time_gaps import cut_at_gaps
-from simpel_cli.data.timing.joined_tables import Joined, read_joined
 from simpel_cli.data.timing.when_measured import refuse_unplaced, when_measured
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
-
-
-class _Tables(NamedTuple):
-    """What the files hold.
-
-    Args:
-        config: with the names that columns have in the tables.
-        table: of `data.path`.
-        joined: of other sensors.
-    """
-
-    config: Measurements
-    table: Table
-    joined: tuple[Joined, ...]
 
 
 def read(
@@ -91,26 +73,15 @@ def read(
             f"{key}.between_rows: {name} is linear, but the next value of an input is not known in layout 'transitions', whose "
             f"rows do not follow each other. Store trajectories, or set data.between_rows={{{name}: held}}."
         )
-    tables = _tables(config, model, base)
-    recording = _recorded(tables, model, known, base, seed, whole=whole, partial=partial)
+    files = read_files(config, model, base)
+    recording = _recorded(files, model, known, base, seed, whole=whole, partial=partial)
     if too_few is not None and too_few(recording):
-        return _recorded(tables, model, known, base, seed, whole=whole, partial=False)
+        return _recorded(files, model, known, base, seed, whole=whole, partial=False)
     return recording
 
 
-def _tables(config: Measurements, model: Source, base: Path) -> _Tables:
-    """Read the files."""
-    found = [file for path in config.paths for file in locate(path, base)]
-    table = read_table(tuple(file.path for file in found), [file.named for file in found])
-    config = with_short_names(config, table, tuple(q.name for q in model.outputs))
-    table = with_computed(table, config.computed)
-    joined = read_joined(config, table, base)
-    config = with_names_of_joined(config, [other.table for other in joined], table)
-    return _Tables(config, table, joined)
-
-
 def _recorded(
-    tables: _Tables,
+    files: Files,
     model: Source,
     known: dict[str, tuple[str, ...]],
     base: Path,
@@ -120,7 +91,7 @@ def _recorded(
     partial: bool | None,
 ) -> Recording:
     """Check and cut what the files hold; known: the groups of a fit; others as of `read`."""
-    config, table, joined = tables
+    config, table, joined = files
     quantities = (*model.states, *model.outputs, *model.inputs)
     mapping = map_columns(config, model, table, joined)
     refuse_unplaced(config, model, mapping)

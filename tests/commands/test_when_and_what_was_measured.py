@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import csv, rig, simpel, swing
 
-from simpel_cli.data import reader
+from simpel_cli.data import files
 
 FEW = (
     "method=sysid",
@@ -147,13 +147,13 @@ def test_few_rows_are_read_once_and_those_that_are_whole_count(tmp_path: Path, m
     """27 training rows calibrate no filter."""
     table = [[*row[:3], "" if i % 10 == 5 else row[3], row[4]] for i, row in enumerate(swing(4, 9))]
     rig(tmp_path, measurements=csv(table))
-    asked, read_once = [], reader.read_table
+    asked, read_once = [], files.read_table
 
     def counted(*given: Any) -> Any:
         asked.append(given)
         return read_once(*given)
 
-    monkeypatch.setattr(reader, "read_table", counted)
+    monkeypatch.setattr(files, "read_table", counted)
     done = simpel(tmp_path, "fit", *OWN, *FEW, "hydra.run.dir=run")
     assert done.code == 0, done.err
     assert len(asked) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from simpel_cli.data import Measurements, Recording, read, reader
+from simpel_cli.data import Measurements, Recording, files, read
 from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.errors import DataError
@@ -86,13 +86,13 @@ def test_a_fit_still_takes_complete_rows_only(tmp_path) -> None:
 def test_of_too_few_rows_those_that_are_whole_are_taken_from_the_same_reading(tmp_path, monkeypatch) -> None:
     recorded(tmp_path, missing={"phi": 0.04})
     config = Measurements(path=str(tmp_path / "runs.parquet"), time="t", episode="episode", split={"column": "split"})
-    asked, read_once = [], reader.read_table
+    asked, read_once = [], files.read_table
 
     def counted(*given: Any) -> Any:
         asked.append(given)
         return read_once(*given)
 
-    monkeypatch.setattr(reader, "read_table", counted)
+    monkeypatch.setattr(files, "read_table", counted)
     whole = read(config, swing(), tmp_path, 0)
     fallen, kept = (
         read(config, swing(), tmp_path, 0, partial=True, too_few=lambda _, few=few: few) for few in (True, False)
