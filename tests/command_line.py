@@ -107,8 +107,8 @@ def process(cwd: Path, *words: object, timeout: float = PATIENCE) -> Result:
     return Result(child.returncode, out, err)
 
 
-def swing(episodes: int = 6, rows: int = 30, dt: float = 0.05) -> list[list[float]]:
-    """Rows (run, t, pos, vel, volts) of a damped cart on a spring."""
+def swing(episodes: int = 6, rows: int = 30, dt: float = 0.05, substeps: int = 10) -> list[list[float]]:
+    """Rows (run, t, pos, vel, volts) of a damped cart on a spring, by so many Euler steps per row."""
     random = np.random.default_rng(0)
     table = []
     for run in range(episodes):
@@ -116,9 +116,9 @@ def swing(episodes: int = 6, rows: int = 30, dt: float = 0.05) -> list[list[floa
         for i in range(rows):
             u = float(np.sin(0.3 * i + run))
             table.append([run, round(i * dt, 4), s + 1e-4 * random.normal(), v + 1e-3 * random.normal(), u])
-            for _ in range(10):
-                v += (2 * u - 20 * s - 0.5 * v) / 1.2 * dt / 10
-                s += v * dt / 10
+            for _ in range(substeps):
+                v += (2 * u - 20 * s - 0.5 * v) / 1.2 * dt / substeps
+                s += v * dt / substeps
     return table
 
 

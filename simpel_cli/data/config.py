@@ -16,6 +16,7 @@ LAWS = ("auto", "gaussian", "student_t")
 NOISE = ("law", "scale")
 SPLIT_BY = ("episode", "time")
 OF_INPUTS = {  # what to do where one is named
+    "noise.scale": "only states and outputs are measured with noise. An input may stand in the expression of one of them.",
     "latency": "only states and outputs are recorded late. One that acts late is sim.inputs.{0}.delay.",
     "sensor": "only states and outputs have a sensor that saturates. What acts is its column: clip it there.",
     "times": "the times of inputs are those of the rows, data.time. Only states and outputs have clocks of their own.",
@@ -153,7 +154,7 @@ class Measurements:
                     f"data.noise.{key}: no such key, only {' or '.join(NOISE)}.{did_you_mean(key, NOISE)}"
                 )
         _check_scale(self.noise.get("scale"))
-        _one_of("noise.law", self.law, LAWS)
+        _one_of("noise.law", self.noise.get("law", "auto"), LAWS)
         for name, word in self.between_rows.items():
             _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
         _check_split(self.split)
@@ -245,7 +246,7 @@ class Measurements:
                 if name not in allowed:
                     if key in OF_INPUTS and name in quantities:
                         raise ConfigError(f"data.{key}.{name}: {name} is an input; {OF_INPUTS[key].format(name)}")
-                    of_sensors = dict.fromkeys(("latency", "times", "sensor"), "state or output")
+                    of_sensors = dict.fromkeys(("latency", "times", "sensor", "noise.scale"), "state or output")
                     what = (of_sensors | {"between_rows": "input"}).get(key, "quantity")
                     raise ConfigError(
                         f"data.{key}.{name}: the simulator has no such {what} (it has: {', '.join(allowed)})."
@@ -253,7 +254,7 @@ class Measurements:
                     )
 
 
-def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         hint = did_you_mean(str(value), list(allowed))
         raise ConfigError(f"data.{key}: {value!r} is not allowed, only {' or '.join(allowed)}.{hint}")
@@ -266,9 +267,11 @@ def _check_scale(scale: Any) -> None:
         )
     for name, formula in (scale or {}).items():
         if not isinstance(formula, str):
-            _positive(f"noise.scale.{name}", formula)
-            if formula is None:
-                raise ConfigError(f"data.noise.scale.{name}: no expression. Write one, e.g. 0.01 + 0.05*abs({name}).")
+            if not (_is_number(formula) and 0 < formula < float("inf")):
+                raise ConfigError(
+                    f"data.noise.scale.{name}: {formula!r} is not allowed, only an expression of the row or a positive number. "
+                    f"Write one, e.g. 0.01 + 0.05*abs({name}), or leave {name} out: its noise is then the same in every row."
+                )
             continue
         try:
             symbols_used(formula)

@@ -1,6 +1,7 @@
 """From a data YAML and a simulator to a `Recording`: find, read, check, cut, estimate, resample."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,27 +10,31 @@ from simpel_cli.data.checks import clock, sensors, values
 from simpel_cli.data.checks.noise import runs, third_difference_std
 from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
-from simpel_cli.data.computed import with_computed
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
 from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
+from simpel_cli.data.files import Files, read_files
 from simpel_cli.data.groups import group_names, with_groups
 from simpel_cli.data.recording import Check, Episode, Recording, Source
 from simpel_cli.data.resample import resample
 from simpel_cli.data.rows import Mapping, Rows, arrange, map_columns, named_episodes
 from simpel_cli.data.split import PARTS, assign
-from simpel_cli.data.tables.column_names import with_names_of_joined, with_short_names
-from simpel_cli.data.tables.locate import by_file, locate
-from simpel_cli.data.tables.table import read_table
+from simpel_cli.data.tables.locate import by_file
 from simpel_cli.data.time_gaps import cut_at_gaps
-from simpel_cli.data.timing.joined_tables import read_joined
 from simpel_cli.data.timing.when_measured import refuse_unplaced, when_measured
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
 
 
 def read(
-    config: Measurements, model: Source, base: Path, seed: int, *, whole: bool = True, partial: bool | None = None
+    config: Measurements,
+    model: Source,
+    base: Path,
+    seed: int,
+    *,
+    whole: bool = True,
+    partial: bool | None = None,
+    too_few: Callable[[Recording], bool] | None = None,
 ) -> Recording:
     """Read measurements for a simulator.
 
@@ -42,6 +47,8 @@ def read(
             stays NaN.
         partial: rows may lack values, and values may be measured before their row (`Episode.late`); None: unless `whole`. With
             `whole`, the filter is to estimate what is missing (`filtering.estimated_rows`): rows still have to be dt apart.
+        too_few: whether of partial rows there are too few to estimate what is missing, so that only whole rows count; None:
+            never.
 
     Returns:
         Checked episodes, at least one each to train and to test on, unless the data YAML keeps none to test on.
@@ -56,8 +63,8 @@ def read(
     if not config.paths:
         return Recording((), (), (), dict(config.noise_std), (), (), ())
     measurable = (*model.states, *model.outputs)
-    quantities = (*measurable, *model.inputs)
-    config.check_names(tuple(q.name for q in quantities), tuple(q.name for q in measurable))
+    names = tuple(q.name for q in measurable)
+    config.check_names((*names, *(q.name for q in model.inputs)), names)
     linear = model.linear if isinstance(model, Model) else ()
     if linear and config.layout == "transitions":
         name = model.inputs[linear[0]].name
@@ -66,12 +73,26 @@ def read(
             f"{key}.between_rows: {name} is linear, but the next value of an input is not known in layout 'transitions', whose "
             f"rows do not follow each other. Store trajectories, or set data.between_rows={{{name}: held}}."
         )
-    found = [file for path in config.paths for file in locate(path, base)]
-    table = read_table(tuple(file.path for file in found), [file.named for file in found])
-    config = with_short_names(config, table, tuple(q.name for q in model.outputs))
-    table = with_computed(table, config.computed)
-    joined = read_joined(config, table, base)
-    config = with_names_of_joined(config, [other.table for other in joined], table)
+    files = read_files(config, model, base)
+    recording = _recorded(files, model, known, base, seed, whole=whole, partial=partial)
+    if too_few is not None and too_few(recording):
+        return _recorded(files, model, known, base, seed, whole=whole, partial=False)
+    return recording
+
+
+def _recorded(
+    files: Files,
+    model: Source,
+    known: dict[str, tuple[str, ...]],
+    base: Path,
+    seed: int,
+    *,
+    whole: bool,
+    partial: bool | None,
+) -> Recording:
+    """Check and cut what the files hold; known: the groups of a fit; others as of `read`."""
+    config, table, joined = files
+    quantities = (*model.states, *model.outputs, *model.inputs)
     mapping = map_columns(config, model, table, joined)
     refuse_unplaced(config, model, mapping)
     dynamic = bool(model.states) and config.layout == "trajectories"

@@ -185,6 +185,12 @@ def _counted(recording: Recording, study: Study) -> Recording:
     return recording if scale is None else scale.counted(recording)
 
 
+def _alike(recording: Recording) -> Recording:
+    """Return measurements that all count alike."""
+    train, test = (tuple(e._replace(weight=None) for e in part) for part in (recording.train, recording.test))
+    return recording._replace(train=train, test=test)
+
+
 def _with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
     """Return the configuration whose data say how late each reading is, so that whatever follows takes it so."""
     data = declared.config["data"]
@@ -200,8 +206,9 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     effects: list[Expression] = groups["effect"]
     terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
     declared_noise = tuple(study.measurements.noise_std)
-    clean = cleaned(study.recording, model, declared_noise)
-    clean = clean._replace(recording=_counted(clean.recording, study))
+    clean = cleaned(_counted(study.recording, study), model, declared_noise)
+    # once more: what is typical is not what a lone value would make of it
+    clean = clean._replace(recording=_counted(_alike(clean.recording), study))
     recording = clean.recording
     bad = [c for c in recording.checks if not c.ok]
     terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{len(recording.checks)} ok", "data")

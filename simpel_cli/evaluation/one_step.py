@@ -15,8 +15,10 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.evaluation.bootstrap import Blocks, bootstrap, interval_rows
 from simpel_cli.evaluation.posterior import CHUNK, Posterior
 from simpel_cli.inference.predictive import Predictive
+from simpel_cli.inference.sensor_ends import share
 
 LEVELS = np.arange(0.05, 0.951, 0.05)
+COVERAGE = 0.9
 
 
 class OneStep(NamedTuple):
@@ -26,8 +28,8 @@ class OneStep(NamedTuple):
     squared: np.ndarray  # (n, dy + 1), joint = sum over outputs
     absolute: np.ndarray  # (n, dy + 1)
     crps: np.ndarray  # (n, dy + 1)
-    inside: np.ndarray  # (n, dy + 1), 1 within the central 90 % region
-    below: np.ndarray  # (n, dy + 1, levels), 1 where r <= chi-squared quantile
+    inside: np.ndarray  # (n, dy + 1), 1 within the central 90 % region; the share that is, of a reading at an end
+    below: np.ndarray  # (n, dy + 1, levels), the same of regions of other levels
     mean: np.ndarray  # (n, dy)
     std: np.ndarray  # (n, dy)
     epistemic_std: np.ndarray  # (n, dy)
@@ -38,7 +40,7 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.n
 
     The joint columns: NLL of the joint mixture; squared, absolute error and CRPS summed over outputs; coverage and
     calibration of the Mahalanobis distance against chi-squared with dy degrees of freedom. A value at an end of its sensor has
-    the NLL and CRPS of the reading, and lies in the middle of the mass there or beyond.
+    the NLL and CRPS of the reading, and is covered by the share of the mass there or beyond that is.
 
     Args:
         posterior: the fitted posterior.
@@ -53,19 +55,18 @@ def one_step(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np.n
 
 
 @jax.jit
-def _measure(p: Predictive, y: jax.Array) -> tuple[jax.Array, ...]:
-    pit, seen = p.pit(y), p.filled(y)
-    inner = jnp.abs(2 * pit - 1)  # share of the mass that lies nearer to the median
+def _measure(p: Predictive, y: jax.Array, levels: jax.Array) -> tuple[jax.Array, ...]:
+    low, high = p.pit(y)
+    inner = jnp.abs(low + high - 1)  # share of the mass that lies nearer to the median
     # heavy tails have no chi-squared law: theirs is what a Gaussian of the same share would have
     r = (
-        ((seen - p.mean) / p.std) ** 2
+        ((y - p.mean) / p.std) ** 2
         if p.tail is None
         else jax.scipy.special.ndtri((1 + jnp.minimum(inner, 1 - 1e-12)) / 2) ** 2
     )
-    distance = p.mahalanobis(seen) if p.tail is None else p.share_within(seen)
     columns = (
-        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), pit, r, distance, p.mean, p.reading(p.mean), p.std,
-        p.epistemic_std,
+        -p.log_prob_per_output(y), -p.log_prob(y), p.crps(y), low, high, r, p.within(y, levels), p.mean, p.reading(p.mean),
+        p.std, p.epistemic_std,
     )  # fmt: skip
     return columns
 
@@ -77,21 +78,25 @@ def _one_chunk(posterior: Posterior, x: np.ndarray, y: np.ndarray, precision: np
     p = jax.tree.map(lambda a: a.astype(jnp.float64), p)
     if (precision != 1).any():
         p = p.counting(jnp.asarray(np.pad(precision, pad, mode="edge")))
-    columns = [np.asarray(a)[:n] for a in _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")))]
-    nll, joint, crps, pit, r, distance, mean, read, std, epistemic = columns
-    if p.tail is not None:  # a share of the mass: the distance that a Gaussian of the same share would have
-        distance = chi_squared_quantile(distance, dy)
+    levels = np.append(LEVELS, COVERAGE)
+    measured = _measure(p, jnp.asarray(np.pad(y, pad, mode="edge")), jnp.asarray(levels))
+    columns = [np.asarray(a)[:n] for a in measured]
+    nll, joint, crps, low, high, r, within, mean, read, std, epistemic = columns
     error = y - read  # of a sensor that saturates: of what it would read of the mean
-    quantiles = np.stack([chi_squared_quantile(LEVELS, 1)] * dy + [chi_squared_quantile(LEVELS, dy)])
-    r_all = np.column_stack([r, distance])
-    inside = np.column_stack([np.abs(pit - 0.5) <= 0.45, distance <= chi_squared_quantile(0.9, dy)])
+    below, inside = np.empty((n, dy + 1, len(LEVELS))), np.empty((n, dy + 1))
+    below[:, dy], inside[:, dy] = within[:, :-1], within[:, -1]
+    for i in range(dy):
+        shares = share(low[:, i], high[:, i], ((1 - levels) / 2, (1 + levels) / 2))
+        inside[:, i] = shares[:, -1]
+        at_end = (high > low)[:, i, None]
+        below[:, i] = np.where(at_end, shares[:, :-1], r[:, i, None] <= chi_squared_quantile(LEVELS, 1)[None])
     return OneStep(
         nll=np.column_stack([nll, joint]),
         squared=_with_sum(error**2),
         absolute=_with_sum(np.abs(error)),
         crps=_with_sum(crps),
-        inside=inside.astype(float),
-        below=(r_all[:, :, None] <= quantiles[None]).astype(float),
+        inside=inside,
+        below=below,
         mean=mean,
         std=std,
         epistemic_std=epistemic,

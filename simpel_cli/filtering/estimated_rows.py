@@ -5,15 +5,17 @@ the smoothed state moves:
 
     y_k = y(t_k - d) + d/(t_k - t_{k-1}) (y^_k - y^_{k-1}),    y^: smoothed
 
-One that is missing is the smoother's mean where it is learned from. Where a posterior is tested it is the filter's, which has
-not seen what comes next. The variance v of an estimate, over that of a measured value, says how much the changes count in which
-it has a part (`Episode.weight`): errors in variables, by their size.
+Where the stamps of rows stray, values move to even rows (`even_rows`). One that is missing is the smoother's mean where it
+is learned from. Where a posterior is tested it is the filter's, which has not seen what comes next. The variance v of an
+estimate, over that of a measured value, says how much the changes count in which it has a part (`Episode.weight`): errors in
+variables, by their size.
 
 Reference: Sarkka (2013), Bayesian filtering and smoothing, ch. 8; Fuller (1987), Measurement error models, sec. 1.1.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.errors import DataError
+from simpel_cli.filtering.even_rows import even_times, inputs_at, moved, uneven
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.latent_force import smooth
@@ -60,16 +63,23 @@ def whole(recording: Recording) -> bool:
     )
 
 
-def enough(recording: Recording) -> bool:
-    """Whether there are rows enough to calibrate a filter by."""
-    return sum(len(e.time) for e in recording.train) >= LEAST_ROWS
+def needed(recording: Recording, model: Model) -> bool:
+    """Whether rows are not whole, or not even, and there are enough to calibrate a filter by."""
+    if not model.states or sum(len(e.time) for e in recording.train) < LEAST_ROWS:
+        return False
+    return not whole(recording) or uneven((*recording.train, *recording.test), model.dt)
+
+
+def too_few(recording: Recording) -> bool:
+    """Whether values are missing and there are too few rows to calibrate a filter by."""
+    return not whole(recording) and sum(len(e.time) for e in recording.train) < LEAST_ROWS
 
 
 def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[str]) -> Recording:
     """Return a recording whose rows are whole.
 
     Args:
-        recording: rows that may lack values, or have values that were measured before their row.
+        recording: rows that may lack values, have values that were measured before their row, or stray from even ones.
         model: the simulator.
         declared_noise: names of the channels whose noise the user declared.
 
@@ -85,13 +95,14 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
     z = _calibrated(plan)
     parameters, level = plan.coordinates.physical(jnp.asarray(z))
     p, noise = np.asarray(parameters), np.asarray(level.r)
+    even = uneven((*recording.train, *recording.test), model.dt)
     train = _of_episodes(plan, tracks, z, recording.train, recording.outputs)
     test = _of_episodes(plan, tracks, z, recording.test, recording.outputs) if recording.test else []
     typical = _typical(plan, noise, train)
     together = _measured_together(recording.test)
-    made = [_made(plan, e, f, p, typical, kept=None) for e, f in zip(recording.train, train, strict=True)]
+    made = [_made(plan, e, f, p, typical, kept=None, even=even) for e, f in zip(recording.train, train, strict=True)]
     tested = [
-        _once_known(_made(plan, e, f, p, typical, kept=together), e, together)
+        _once_known(_made(plan, e, f, p, typical, kept=together, even=even), e, together)
         for e, f in zip(recording.test, test, strict=True)
     ]
     good, left = [[e for e in part if np.isfinite(e.states).all()] for part in (made, tested)]
@@ -100,7 +111,8 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
             f"sim: the filter of {model.name} lost the measurements in all of {len(made)} episodes, so that nothing tells the "
             "values that are missing. Give rows in which everything was measured, or narrow sim.parameters."
         )
-    checks = (*recording.checks, _check(plan, recording, good, noise, typical, together))
+    before = tuple(_moved_to_even(c) if even else c for c in recording.checks)
+    checks = before if whole(recording) else (*before, _check(plan, recording, good, noise, typical, together))
     level_of = {q.name: float(np.sqrt(v)) for q, v in zip(plan.augmented.model.states, typical, strict=True)}
     level_of |= dict(zip(plan.augmented.measured, noise.tolist(), strict=True))
     level_of |= {name: std for name, std in recording.noise_std.items() if name in declared_noise}
@@ -177,7 +189,14 @@ def _measured_together(episodes: Sequence[Episode]) -> np.ndarray:
 
 
 def _made(
-    plan: Setup, episode: Episode, found: _Found, p: np.ndarray, typical: np.ndarray, kept: np.ndarray | None
+    plan: Setup,
+    episode: Episode,
+    found: _Found,
+    p: np.ndarray,
+    typical: np.ndarray,
+    kept: np.ndarray | None,
+    *,
+    even: bool,
 ) -> Episode:
     """Return the episode with every value at its row.
 
@@ -188,6 +207,7 @@ def _made(
         p: parameters of the model, physical.
         typical: variance of a measured value, per state.
         kept: of an episode to test on, which columns tell estimates from measurements; None: of one to learn from.
+        even: whether rows stray, and move to even ones.
     """
     model, n_states = plan.augmented.model, episode.states.shape[1]
     values = np.concatenate([episode.states, episode.outputs], axis=1)
@@ -205,6 +225,16 @@ def _made(
     if episode.late is not None:
         at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
         values = values + np.where(at_an_end, 0.0, _moved(episode, smoothed))
+    time, inputs = episode.time, episode.inputs
+    if even:
+        time = even_times(episode.time)
+        inputs = inputs_at(episode.time, time, episode.inputs, model.linear)
+        rates = partial(_rates, model, p)
+        there_then = found.smooth + moved(episode.time, time, found.smooth, episode.inputs, model.linear, rates)
+        read = _read(model, there_then, episode._replace(inputs=inputs), p, plan)
+        shift = np.nan_to_num(np.concatenate([there_then, read], axis=1) - smoothed)
+        at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
+        values, estimate = values + np.where(at_an_end, 0.0, shift), estimate + shift
     weight = np.full(values.shape, NOTHING)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight[:, :n_states] = np.minimum(typical[None] / variance, MOST_WEIGHT)
@@ -215,11 +245,21 @@ def _made(
         weight[:, ~kept] = 1.0
     filled = np.where(there, values, estimate)
     return episode._replace(
+        time=time,
+        inputs=inputs,
         states=filled[:, :n_states],
         outputs=filled[:, n_states:],
         late=None,
         weight=None if (weight == 1).all() else weight,
     )
+
+
+def _moved_to_even(check: Check) -> Check:
+    """Say of strayed stamps what was done."""
+    if check.name != "jitter":
+        return check
+    said = check.detail.split("; data.resample")[0]
+    return check._replace(ok=True, detail=f"{said}; values moved to even rows by what the simulator does there")
 
 
 def _once_known(whole: Episode, measured: Episode, kept: np.ndarray) -> Episode:
@@ -242,6 +282,12 @@ def _read(model: Model, states: np.ndarray, episode: Episode, p: np.ndarray, pla
     at = np.tile(p[: len(model.params), None], (1, len(states)))
     read = np.asarray(model.function().map(len(states))(states.T, np.nan_to_num(episode.inputs).T, at)[1])
     return read.T[:, columns]
+
+
+def _rates(model: Model, p: np.ndarray, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Return the rates of the states at rows, (T, nx)."""
+    at = np.tile(p[: len(model.params), None], (1, len(states)))
+    return np.asarray(model.function().map(len(states))(states.T, np.nan_to_num(inputs).T, at)[0]).T
 
 
 def _moved(episode: Episode, smoothed: np.ndarray) -> np.ndarray:

@@ -181,7 +181,8 @@ def _noise(chooser: Chooser, moments: Moments, chosen: Chosen) -> np.ndarray:
         return np.asarray(chosen.law.scale, float)
     return np.array(
         [
-            sigma or marginal_likelihood_scales(*moments.whitened(i), chooser.noise_init[i], moments.white, kappa).noise
+            sigma
+            or marginal_likelihood_scales(*moments.whitened(i), chooser.noise_init[i], moments.white_of(i), kappa).noise
             for i, (sigma, kappa) in enumerate(zip(chosen.noise.tolist(), chosen.gap.tolist(), strict=True))
         ]
     )

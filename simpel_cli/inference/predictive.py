@@ -5,6 +5,7 @@ p(y | x) = 1/L sum_l prod_i p_i((y_i - h_li(x)) / sigma_i) / sigma_i,    p_i Gau
 Of a sensor that saturates a value at an end has the mass there or beyond in place of the density (`sensor_ends`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -24,8 +25,8 @@ class Predictive(NamedTuple):
             same in every row, or (n, dy), one of every row.
         tail: 1/nu of Student's t, positive; None: the noise is Gaussian.
         limits: lowest and highest reading of every output's sensor, infinite where there is no end; None: no sensor saturates.
-            `log_prob`, `cdf`, `pit` and `crps` are those of the reading; mean, standard deviation and `mahalanobis` are those
-            of the quantity with its noise.
+            `log_prob`, `cdf`, `pit`, `within` and `crps` are those of the reading; mean, standard deviation and `mahalanobis`
+            are those of the quantity with its noise.
     """
 
     particles: Float[Array, "L n dy"]
@@ -112,22 +113,32 @@ class Predictive(NamedTuple):
         below = jax.scipy.stats.norm.cdf(z) if self.tail is None else student_t.cdf(z, self.tail[None, None])
         return jnp.mean(below, axis=0)
 
-    def pit(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-        """Probability integral transform of y: `cdf`; at an end of a sensor the middle of the mass there or beyond."""
+    def pit(self, y: Float[Array, "n dy"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
+        """Probability integral transforms of y, from F(y-) to F(y): `cdf`, and at an end of a sensor all of the mass there."""
         found = self._cdf(y)
         if self.limits is None:
-            return found
+            return found, found
         at_low, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
-        return jnp.where(at_high, (1 + found) / 2, jnp.where(at_low, found / 2, found))
+        return jnp.where(at_low, 0.0, found), jnp.where(at_high, 1.0, found)
 
-    def filled(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-        """Return y with a value in the middle of the mass beyond, by a Gaussian, for one at an end of its sensor."""
+    def within(self, y: Float[Array, "n dy"], levels: Float[Array, " k"]) -> Float[Array, "n k"]:
+        """Return whether y lies in the region of the smallest Mahalanobis distances that holds these shares of the mass.
+
+        A reading at an end counts by the share of what it may hide that lies there: of every particle, by the likelihood that
+        it gives to y, what is beyond the end. The share of a distance is that of a chi-squared variable, or `share_within`.
+        """
+        share = self._chi_squared_share if self.tail is None else self._share_of(512)
+
+        def inside(y: Float[Array, "n dy"]) -> Float[Array, "n k"]:
+            return (share(y)[:, None] <= levels[None]).astype(y.dtype)
+
         if self.limits is None:
-            return y
-        at_low, at_high = sensor_ends.ends(jnp.asarray(self.limits), y)
-        least = 1e-12
-        middle = self.mean + self.std * jax.scipy.special.ndtri(jnp.clip(self.pit(y), least, 1 - least))
-        return jnp.where(at_low | at_high, middle, y)
+            return inside(y)
+        scale = jnp.broadcast_to(self._scales, y.shape)
+        values = sensor_ends.hidden(self.particles, scale, self.tail, jnp.asarray(self.limits), y)
+        belief = jax.nn.softmax(jnp.sum(self._log_readings(y), axis=-1), axis=0)
+        of_particles = jax.lax.map(lambda own: jnp.mean(jax.lax.map(inside, own), axis=0), values)
+        return jnp.sum(belief[:, :, None] * of_particles, axis=0)
 
     def reading(self, value: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Return what sensors make of a value."""
@@ -171,22 +182,36 @@ class Predictive(NamedTuple):
         """Squared Mahalanobis distance of y under the mixture's mean and covariance (chi-squared with dy if Gaussian)."""
         return jnp.sum(self._white(y) ** 2, axis=-1)
 
+    def _chi_squared_share(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
+        """Share of a chi-squared variable's mass below the Mahalanobis distance of y."""
+        distance = self.mahalanobis(y)
+        found: Array = jax.scipy.special.gammainc(jnp.full_like(distance, y.shape[1] / 2), distance / 2)
+        return found
+
     def share_within(self, y: Float[Array, "n dy"], draws: int = 512) -> Float[Array, " n"]:
         """Share of the mixture's mass with a smaller Mahalanobis distance than y, strictly between 0 and 1.
 
         Where the noise has heavy tails that distance has no law in closed form: it is compared with those of draws.
         """
+        return self._share_of(draws)(y)
+
+    def _share_of(self, draws: int) -> Callable[[Float[Array, "n dy"]], Float[Array, " n"]]:
         key_particle, key_noise = jax.random.split(jax.random.key(0))
-        n, dy = y.shape
+        _, n, dy = self.particles.shape
+        dtype = self.particles.dtype
         chosen = jax.random.randint(key_particle, (draws, n), 0, self.particles.shape[0], jnp.int32)
         centres = jnp.take_along_axis(self.particles, chosen[:, :, None], axis=0)
         if self.tail is None:
-            noise = jax.random.normal(key_noise, (draws, n, dy), y.dtype)
+            noise = jax.random.normal(key_noise, (draws, n, dy), dtype)
         else:
-            noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=y.dtype)
+            noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=dtype)
         others = jax.lax.map(self.mahalanobis, centres + self._scales[None] * noise)
-        nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
-        return (nearer + 0.5) / (draws + 1)
+
+        def share(y: Float[Array, "n dy"]) -> Float[Array, " n"]:
+            nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
+            return (nearer + 0.5) / (draws + 1)
+
+        return share
 
     def _white(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         """Return y about the mixture's mean, in units of its covariance."""

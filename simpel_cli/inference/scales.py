@@ -163,7 +163,10 @@ def _looked(chooser: Chooser, training: Training, key: PRNGKeyArray, law: str) -
     moments = chooser.moments(training.take(rows), key)
     found = [
         marginal_likelihood_scales(
-            *moments.whitened(i), chooser.noise_init[i], moments.white, None if np.isnan(given[i]) else float(given[i])
+            *moments.whitened(i),
+            chooser.noise_init[i],
+            moments.white_of(i),
+            None if np.isnan(given[i]) else float(given[i]),
         )
         for i in range(size)
     ]

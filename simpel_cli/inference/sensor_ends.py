@@ -2,20 +2,26 @@
 
 At an end the reading has the mass of the law there or beyond, between the ends the law's density.
 
+The probability integral transform of a mass is anything between F(y-) and F(y): it counts by the share of these that lies in a
+region, the expectation of a transform drawn at random. So a right predictive is covered as it says, exactly.
+
 Reference: Gneiting and Raftery (2007), Strictly proper scoring rules, JASA 102 (scores of mixed laws; the CRPS as a difference
-of expectations); Czado, Gneiting and Held (2009), Predictive model assessment for count data, Biometrics 65 (the transform of a
-mass).
+of expectations); Smith (1985), Diagnostic checks of non-standard time series models, J. Forecasting 4, and Czado, Gneiting and
+Held (2009), Predictive model assessment for count data, Biometrics 65 (the transform of a mass).
 """
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from simpel_cli.inference import student_t
 
 MOST_CELLS, FEWEST_CELLS, MOST_ATOMS = 128, 32, 4096
+HIDDEN = 32  # values per particle that a reading at an end may hide
+STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0]) % 1  # of a lattice, one per output
 WIDEST, HALVINGS = 100.0, 60  # scales within which quantiles of Student's t are looked for
 
 
@@ -29,6 +35,44 @@ def log_cdf(z: Float[Array, "*n"], tail: Float[Array, "*m"] | None) -> Float[Arr
     if tail is None:
         return jax.scipy.special.log_ndtr(z)
     return jnp.log(jnp.maximum(student_t.cdf(z, tail), jnp.finfo(z.dtype).tiny))
+
+
+def share(low: np.ndarray, high: np.ndarray, between: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the share of the transforms from low to high, (n,), that lies between two levels, each (k,); shape (n, k)."""
+    low, high = low[:, None], high[:, None]
+    inside = (low >= between[0]) & (low <= between[1])
+    covered = np.minimum(high, between[1]) - np.maximum(low, between[0])
+    apart = high > low
+    found: np.ndarray = np.where(apart, np.maximum(covered, 0) / np.where(apart, high - low, 1.0), inside)
+    return found
+
+
+def hidden(
+    particles: Float[Array, "L n dy"],
+    scale: Float[Array, "n dy"],
+    tail: Float[Array, " dy"] | None,
+    limits: Float[Array, "dy 2"],
+    y: Float[Array, "n dy"],
+) -> Float[Array, "L K n dy"]:
+    """Return values that may lie behind readings, in K equal shares of every particle's mass at or beyond an end.
+
+    Shares of several outputs go through a lattice, since they are independent under a particle. Readings between the ends are
+    what they are. Arguments are those of `crps`.
+    """
+    at_low, at_high = ends(limits, y)
+    side = jnp.where(at_high, 1.0, -1.0).astype(y.dtype)[None]
+    nodes = (np.arange(HIDDEN)[:, None] * STEPS[None] + 0.5 / HIDDEN) % 1
+    nodes[:, 0] = (np.arange(HIDDEN) + 0.5) / HIDDEN
+    outputs = np.arange(y.shape[1]) % nodes.shape[1]
+    level = jnp.asarray(nodes[:, outputs], y.dtype)[None, :, None]
+    beyond = jnp.exp(log_cdf(side * (particles - y[None]) / scale[None], None if tail is None else tail[None, None]))
+    least = jnp.maximum(beyond[:, None] * level, jnp.finfo(y.dtype).tiny)
+    if tail is None:
+        z = jax.scipy.special.ndtri(least)
+    else:
+        z = jnp.moveaxis(jax.lax.map(lambda given: student_t.quantile(*given), (jnp.moveaxis(least, 3, 0), tail)), 0, 3)
+    value = particles[:, None] - side[None] * scale[None, None] * z
+    return jnp.where((at_low | at_high)[None, None], value, y[None, None])
 
 
 def crps(

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 MOST_TAIL = 0.45  # a little below 1/2, where the variance ends
+QUANTILES = 600  # entries of the table of quantiles, on either side
 NODES, FARTHEST = 96, 60.0  # of the table of expected distances; of its last entry, in scales
 
 
@@ -50,6 +51,13 @@ def cdf(z: Float[Array, "*n"], tail: Float[Array, "*m"]) -> Float[Array, "*n"]:
     nu = jnp.broadcast_to(1 / tail, z.shape)
     below = 0.5 * jax.scipy.special.betainc(nu / 2, jnp.full_like(z, 0.5), nu / (nu + z * z))
     return jnp.where(z > 0, 1 - below, below)
+
+
+def quantile(level: Float[Array, "*n"], tail: Float[Array, ""]) -> Float[Array, "*n"]:
+    """Return the standardised error below which lies a share of the mass, by a table, to 1e-3 of it."""
+    half = jnp.sinh(jnp.linspace(0.0, 9.0, QUANTILES, dtype=level.dtype))
+    grid = jnp.concatenate([-half[:0:-1], half])
+    return jnp.interp(level, cdf(grid, jnp.broadcast_to(tail, grid.shape)), grid)
 
 
 def expected_distance(mu: Float[Array, "*n"], tail: Float[Array, "*m"]) -> Float[Array, "*n"]:

@@ -90,12 +90,14 @@ class ExactGP:
             known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(phi, problem.x)
             correlation = gram(kernel, known, known)
-            data = weighted_spectra(correlation, left, problem.m, problem.weights)
+            data = weighted_spectra(correlation, left, problem.m, problem.weights, None, kappa, white)
             telling = data
             if problem.tells is not None:
-                telling = weighted_spectra(correlation, left, problem.m, problem.weights, problem.tells)
+                telling = weighted_spectra(correlation, left, problem.m, problem.weights, problem.tells, kappa, white)
             prior_std = self.noise.prior_std if self.noise.learn else None
-            best = best_scales(telling, kappa, white, prior_std, problem.noise_floor, problem.noise_init)
+            # of rows that count by their weights both are in the spectra already
+            scales, left_over = (kappa, white) if problem.weights is None else (jnp.ones_like(kappa), 0.0)
+            best = best_scales(telling, scales, left_over, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 phi,
                 data,
@@ -125,7 +127,8 @@ class ExactGP:
                 reach: Float[Array, "n m"],
                 turned: Float[Array, " m"],
             ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-                total = kappa**2 * values + sigma.astype(jnp.float64) ** 2 + white
+                known = kappa**2 * values + white if problem.weights is None else values
+                total = known + sigma.astype(jnp.float64) ** 2
                 taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
                 std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + white)
                 return kappa**2 * (reach @ (turned / total)), std

@@ -186,14 +186,15 @@ class Pathwise:
                 own, left, kappa, floor, typical, root = given
                 # rows count by their weights; those that tell nothing of the noise are left out, as padding is
                 real, left = root * counts[few], root * left
-                law = (own @ own.T + kappa**2 * correlation) * real[:, None] * real[None]
+                known = own @ own.T + kappa**2 * correlation + white * jnp.eye(len(left), dtype=jnp.float64)
+                law = known * real[:, None] * real[None]
                 values, vectors = jnp.linalg.eigh(law)
                 turned = vectors.T @ (left * counts[few])[:, None]
                 silent = jnp.sum(jnp.where(real > 0, 0.0, 1.0))
                 spectrum = Spectrum(jnp.maximum(values, 0.0), vectors, turned, silent)
                 one = jnp.ones((1,), jnp.float64)
                 prior_std = self.noise.prior_std if self.noise.learn else None
-                return best_scales(spectrum, one, white, prior_std, floor[None], typical[None]).noise[0]
+                return best_scales(spectrum, one, 0.0, prior_std, floor[None], typical[None]).noise[0]
 
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(
@@ -216,7 +217,7 @@ class Pathwise:
             mean = jnp.mean(draws[:, :, self.particles :].astype(jnp.float64), axis=2)
             sigma = noise_by_marginal_likelihood(own, mean)
             common = sigma**2 + white
-            variance = common[None] / weights  # of every row: of one that is far off, it is large
+            variance = sigma[None] ** 2 / weights + white  # of every row: of one that is far off, it is large
             measured = jnp.asarray(problem.y)[rows].astype(jnp.float64)
             noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None]
             seen = measured[:, :, None] + jnp.moveaxis(noise, 0, -1)

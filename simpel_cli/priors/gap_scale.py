@@ -1,6 +1,6 @@
 """Scales of the gap GP and of the noise, chosen by the marginal likelihood of the training transitions (empirical Bayes).
 
-    y ~ N(mean(g), cov(g) + kappa^2 rho(X, X) + (w + sigma^2) I),   maximise over kappa and sigma
+    y ~ N(mean(g), cov(g) + kappa^2 rho(X, X) + w I + sigma^2 W^-1),   maximise over kappa and sigma
 
 The function is integrated out, so that the noise is not what a network leaves that goes through every one of a few points.
 
@@ -29,7 +29,7 @@ def marginal_likelihood_scales(
     correlation: np.ndarray,
     targets: np.ndarray,
     noise_init: float,
-    white_variance: float,
+    white_variance: float | np.ndarray,
     gap: float | None = None,
 ) -> Scales:
     """Return the kappa and sigma of one output that maximise its (penalised) log marginal likelihood.
@@ -42,18 +42,19 @@ def marginal_likelihood_scales(
         correlation: of the gap at the training inputs, shape (m, m).
         targets: normalised targets, shape (m,).
         noise_init: initial noise, normalised.
-        white_variance: white model error of the prior.
+        white_variance: white model error of the prior, of all rows or of each, shape (m,). Where samples, correlation and
+            targets were multiplied by the roots of the rows' weights W, it is w W: only noise goes with the weight.
         gap: kappa, where it is known; None: it is chosen, too.
     """
     residual = targets - samples.mean(axis=0)
     covariance = np.atleast_2d(np.cov(samples, rowvar=False))
     if gap is not None:
         return Scales(gap, _noise(covariance + gap**2 * correlation, residual, noise_init, white_variance))
-    identity = np.eye(len(targets))
+    identity, white = np.eye(len(targets)), np.diag(np.broadcast_to(white_variance, len(targets)))
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
         kappa2, sigma2 = np.exp(2 * theta)
-        factor = cho_factor(covariance + kappa2 * correlation + (white_variance + sigma2) * identity, lower=True)
+        factor = cho_factor(covariance + kappa2 * correlation + white + sigma2 * identity, lower=True)
         inverse = cho_solve(factor, identity)
         weights = inverse @ residual
         fit = residual @ weights / 2 + np.log(np.diag(factor[0])).sum()
@@ -69,13 +70,15 @@ def marginal_likelihood_scales(
     return Scales(kappa, sigma)
 
 
-def _noise(covariance: np.ndarray, residual: np.ndarray, noise_init: float, white_variance: float) -> float:
+def _noise(
+    covariance: np.ndarray, residual: np.ndarray, noise_init: float, white_variance: float | np.ndarray
+) -> float:
     """Return sigma where the covariance of the function is known."""
-    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = np.linalg.eigh(covariance + np.diag(np.broadcast_to(white_variance, len(residual))))
     turned = vectors.T @ residual
 
     def of_noise(log_sigma: float) -> float:
-        total = np.maximum(values, 0.0) + white_variance + np.exp(2 * log_sigma)
+        total = np.maximum(values, 0.0) + np.exp(2 * log_sigma)
         return float(np.sum(turned**2 / total + np.log(total))) / 2 + (log_sigma - np.log(noise_init)) ** 2 / 2
 
     levels = np.linspace(*BOUNDS, LEVELS)

@@ -77,25 +77,31 @@ def weighted_spectra(
     rows: Int[Numbers, ""],
     weights: Float[Numbers, "m dy"] | None,
     tells: Float[Numbers, "m dy"] | None = None,
+    kappa: Float[Array, " dy"] | None = None,
+    white: float = 0.0,
 ) -> Spectrum:
     """Return the spectrum of rows that count by their weights, one per output, leading axis dy; None: all alike, one for all.
 
     Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I). Where
-    `tells` is 0 a row is left out, as padding is.
+    `tells` is 0 a row is left out, as padding is. With weights and `kappa` K is kappa^2 times the correlation, with `white` on
+    its diagonal: what is no noise is not divided by the weights.
     """
     if weights is None:
         return spectrum(correlation, residual, rows)
+    correlation = correlation.astype(jnp.float64)
     root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
     if tells is not None:
         root = root * jnp.asarray(tells).astype(jnp.float64).T
     real = (jnp.arange(len(residual), dtype=jnp.int32) < rows).astype(jnp.float64)
 
-    def of_output(root: Float[Array, " m"], left: Float[Array, " m"]) -> Spectrum:
-        found = spectrum(correlation * root[:, None] * root[None], (left * root)[:, None], rows)
+    def of_output(root: Float[Array, " m"], left: Float[Array, " m"], kappa: Float[Array, ""]) -> Spectrum:
+        known = kappa**2 * correlation + white * jnp.eye(len(root), dtype=jnp.float64)
+        found = spectrum(known * root[:, None] * root[None], (left * root)[:, None], rows)
         silent = jnp.sum(jnp.where(root > 0, 0.0, real))
         return found._replace(padding=found.padding + silent)
 
-    found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T))
+    scale = jnp.ones(len(root), jnp.float64) if kappa is None else kappa
+    found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T, scale))
     return found
 
 
@@ -174,7 +180,7 @@ def noise_of_smooth(
         correlation: at the padded inputs, of a lengthscale so many times the declared one.
         residual: of their targets.
         rows: number of data; see `spectrum`.
-        white: w.
+        white: w; of rows with weights it is divided by them as the noise is: the scale is not known, and with it no basis.
         prior_std: of log sigma; see `best_scales`.
         floor: smallest noise.
         typical: its typical value.

@@ -5,10 +5,11 @@ out and its variance are
 
     e_j = [A^-1 r]_j / [A^-1]_jj,    v_j = 1/[A^-1]_jj,    A = C + sigma^2 W^-1,    r = y - mean(g)
 
-so that e_j/sqrt(v_j) is a held-out sample of the law. The white model error w is part of the noise here: whose tails it has, no
-data tell. Which law, is asked of all outputs together, with one tail 1/nu and a
-scale per output: fifty rows of one output seldom hold an outlier. If it is Student's t, weights W, scales and tails follow by
-expectation and conditional maximisation; every tail has a normal prior about the common one.
+so that e_j/sqrt(v_j) is a held-out sample of the law. The white model error w is part of Student's t noise, and is divided
+by the weights with it: whose tails it has, no data tell. Of Gaussian noise it is not. Which law, is asked of all outputs
+together, with one tail 1/nu and a scale per output: fifty rows of one output seldom hold an outlier. If it is Student's t,
+weights W, scales and tails follow by expectation and conditional maximisation; every tail has a normal prior about the
+common one.
 
 Reference: Rasmussen and Williams (2006), eqs. 5.10-5.12 (leave one out); Liu and Rubin (1995), ML estimation of the t
 distribution using EM and its extensions, ECM and ECME, Statistica Sinica 5 (the tail by the likelihood itself).
@@ -83,6 +84,12 @@ class Moments(NamedTuple):
         correlation = self.correlation[np.ix_(rows, rows)] * np.outer(root, root)
         return self.samples[:, rows, i] * root[None], correlation, self.targets[rows, i] * root
 
+    def white_of(self, i: int) -> np.ndarray:
+        """Return the variance of the white model error of `rows`, (m',), in units in which all targets count alike."""
+        rows = self.rows(i)
+        precision = np.ones(len(rows)) if self.precision is None else self.precision[rows, i]
+        return np.asarray(self.white * precision)
+
     def of_output(self, i: int, kappa: float) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance of the function, (m', m'), and residual, (m',), in units in which all targets count alike."""
         samples, correlation, targets = self.whitened(i)
@@ -137,13 +144,14 @@ def gain_of_tails(moments: Moments, kappa: np.ndarray, sigma: np.ndarray) -> np.
         kappa: scale of the gap, (dy,).
         sigma: Gaussian noise, (dy,).
     """
-    total, sigma = np.zeros(len(TAILS)), np.sqrt(sigma**2 + moments.white)
+    total = np.zeros(len(TAILS))
     for i in range(len(sigma)):
         if moments.silent(i):
             continue
         covariance, residual = moments.of_output(i, kappa[i])
-        found = left_out(covariance, residual, np.full(len(residual), sigma[i] ** 2))
-        scores, _ = profile(found.error / np.sqrt(found.function + sigma[i] ** 2))
+        variance = sigma[i] ** 2 + moments.white_of(i)
+        found = left_out(covariance, residual, variance)
+        scores, _ = profile(found.error / np.sqrt(found.function + variance))
         total += scores[1:] - scores[0]
     return total
 

@@ -102,17 +102,23 @@ def open_study(
 
 
 def _read(measurements: Measurements, source: Source, data_folder: Path, *, whole: bool) -> Recording:
-    """Read measurements; where rows are needed whole and are not, the simulator's filter estimates what they lack."""
+    """Read measurements; where rows are needed whole and even and are not, the simulator's filter makes them so."""
     fills = whole and isinstance(source, Model)
-    recording = read(measurements, source, data_folder, 0, whole=whole, partial=True if fills else None)
-    if not fills or estimated_rows.whole(recording):
-        return recording
-    if not estimated_rows.enough(recording):  # a few rows calibrate no filter: those that are whole count
-        return read(measurements, source, data_folder, 0)
+    if not fills:
+        return read(measurements, source, data_folder, 0, whole=whole)
+    # a few rows calibrate no filter: those that are whole count
+    recording = read(measurements, source, data_folder, 0, partial=True, too_few=estimated_rows.too_few)
     assert isinstance(source, Model)
+    if not estimated_rows.needed(recording, source):
+        return recording
     if recording.groups:
         source = grouped(source.base or source, recording.groups)
-    return estimated_rows.with_estimates(recording, source, tuple(measurements.noise_std))
+    try:
+        return estimated_rows.with_estimates(recording, source, tuple(measurements.noise_std))
+    except DataError:
+        if estimated_rows.whole(recording):  # with rows that stray a fit is worse, but it is one; the check says so
+            return recording
+        raise
 
 
 def refuse_untested(recording: Recording) -> None:

@@ -1,12 +1,16 @@
 """Through the shell: rows that are not whole are fitted, tables of two sensors are joined, and wrong words are named."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from command_line import csv, rig, simpel, swing
+
+from simpel_cli.data import files
 
 FEW = (
     "method=sysid",
@@ -117,6 +121,46 @@ def test_wrong_words_about_times_are_named(tmp_path: Path, words: str, code: int
     for fragment in fragments:
         assert fragment in done.err, done.err
     assert "Traceback" not in done.err
+
+
+def test_stamps_that_stray_by_a_fifth_of_a_row(tmp_path: Path) -> None:
+    """As they are, speeds would be off by about 0.03 m/s, three times the noise."""
+    my = rig(tmp_path)
+    made = simpel(
+        tmp_path, "simulate", "--config-dir", "my", "sim=cart", "simulation.episodes=6", "simulation.steps=40",
+        "simulation.noise_std={s: 0.001, v: 0.01}", "simulation.jitter=0.2",
+        "simulation.initial={s: [-0.3, 0.3], v: [-0.5, 0.5]}", "simulation.seed=3", "out=made",
+    )  # fmt: skip
+    assert made.code == 0, made.err
+    (my / "data" / "strayed.yaml").write_text(
+        "path: ../../made/measurements.parquet\ntime: t\nepisode: episode\nsplit: {column: split}\n"
+    )
+    done = simpel(tmp_path, "fit", "--config-dir", "my", "sim=cart", "data=strayed", *FEW, "hydra.run.dir=run")
+    assert done.code == 0, done.err
+    found = figures(tmp_path / "run")
+    assert found["rmse", "v"] < 0.02
+    assert found["rmse", "s"] < 0.002
+    assert "moved to even rows" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_few_rows_are_read_once_and_those_that_are_whole_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """27 training rows calibrate no filter."""
+    table = [[*row[:3], "" if i % 10 == 5 else row[3], row[4]] for i, row in enumerate(swing(4, 9))]
+    rig(tmp_path, measurements=csv(table))
+    asked, read_once = [], files.read_table
+
+    def counted(*given: Any) -> Any:
+        asked.append(given)
+        return read_once(*given)
+
+    monkeypatch.setattr(files, "read_table", counted)
+    done = simpel(tmp_path, "fit", *OWN, *FEW, "hydra.run.dir=run")
+    assert done.code == 0, done.err
+    assert len(asked) == 1
+    pairs = [i for i in range(9 * 4 - 1) if i % 9 != 8 and i % 10 != 5 and (i + 1) % 10 != 5]
+    n_train = json.loads((tmp_path / "run" / "manifest.json").read_text())["n_train"]
+    test = pq.read_table(tmp_path / "run" / "predictions.parquet").to_pandas().query("output == 'v'")
+    assert n_train + len(test) == len(pairs)
 
 
 def test_groups_and_speeds_that_are_missing(tmp_path: Path) -> None:

@@ -1,10 +1,12 @@
 """Rows in which a sensor did not speak: discover's filter takes them as they are, and each missing value costs itself only."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from simpel_cli.data import Measurements, Recording, read
+from simpel_cli.data import Measurements, Recording, files, read
 from simpel_cli.data.checks.noise import third_difference_std
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.errors import DataError
@@ -79,6 +81,27 @@ def test_a_fit_still_takes_complete_rows_only(tmp_path) -> None:
     whole = read(config, swing(), tmp_path, 0)
     assert all(np.isfinite(e.states).all() for e in whole.train)
     assert len(whole.train) > 4
+
+
+def test_of_too_few_rows_those_that_are_whole_are_taken_from_the_same_reading(tmp_path, monkeypatch) -> None:
+    recorded(tmp_path, missing={"phi": 0.04})
+    config = Measurements(path=str(tmp_path / "runs.parquet"), time="t", episode="episode", split={"column": "split"})
+    asked, read_once = [], files.read_table
+
+    def counted(*given: Any) -> Any:
+        asked.append(given)
+        return read_once(*given)
+
+    monkeypatch.setattr(files, "read_table", counted)
+    whole = read(config, swing(), tmp_path, 0)
+    fallen, kept = (
+        read(config, swing(), tmp_path, 0, partial=True, too_few=lambda _, few=few: few) for few in (True, False)
+    )
+    assert len(asked) == 3
+    for one, other in zip(whole.train, fallen.train, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+    assert whole.checks == fallen.checks
+    assert any(np.isnan(e.states).any() for e in kept.train)
 
 
 def test_a_column_without_any_value_is_refused(tmp_path) -> None:

@@ -74,3 +74,16 @@ def test_tails_beside_a_scale() -> None:
     assert np.mean(tail > 0) > 0.99
     assert tail.max() <= (nu + 1) / nu * (1 + 1e-9)
     assert np.median(tail) == pytest.approx(1.15, abs=0.15)  # most lie near, and count a little more than one
+
+
+def test_a_lone_value_is_judged_by_its_own_noise() -> None:
+    """Fifteen times the noise of a quiet row is less than two of a typical one."""
+    data = recording(2)
+    u = data.train[0].inputs[:, 0]
+    quiet = 20 + int(np.argmin(np.abs(u[20:-20])))
+    states = data.train[0].states.copy()
+    states[quiet, 1] += 15 * NOISE * (0.15 + u[quiet] ** 2)
+    _, found = fitted(
+        counted(data._replace(train=(data.train[0]._replace(states=states), *data.train[1:]))), weighed=False
+    )
+    assert [(p.name, p.split, p.episode, p.row) for p in found.clean.left_out] == [("v", "train", 0, quiet)]

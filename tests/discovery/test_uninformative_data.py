@@ -222,6 +222,22 @@ def test_a_spike_becomes_a_hole_and_not_a_noise() -> None:
     assert cleaned(recording(states), cart(), ("s",)).recording.noise_std["s"] == 0.001
 
 
+def test_a_value_is_no_spike_for_noise_that_it_is_declared_to_have() -> None:
+    states, scale = swing(), np.ones((80, 2))
+    states[[30, 50], 0] += 0.05
+    scale[30, 0] = 20.0  # fifty times the noise, of which twenty are its own
+
+    def weighed(own: Recording) -> Recording:
+        train, test = (tuple(e._replace(weight=scale**-2.0) for e in part) for part in (own.train, own.test))
+        return own._replace(train=train, test=test)
+
+    alike = cleaned(recording(states), cart(), ()).left_out
+    assert {(p.name, p.row) for p in alike} == {("s", 30), ("s", 50)}
+    assert {(p.name, p.row) for p in cleaned(weighed(recording(states)), cart(), ()).left_out} == {("s", 50)}
+    states[30:33, 1] = np.nan  # beside what is missing
+    assert {(p.name, p.row) for p in cleaned(weighed(recording(states)), cart(), ()).left_out} == {("s", 50)}
+
+
 def test_too_many_spikes_are_not_chosen_from() -> None:
     states = swing()
     states[6:-6:12, 0] += 0.05

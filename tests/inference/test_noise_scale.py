@@ -185,8 +185,9 @@ STATIC = {"path": "a.csv"}
     [
         ("abs(y)", r"data\.noise\.scale: 'abs\(y\)' is not allowed, only expressions by name, e\.g\. \{y: 0\.01"),
         ({"y": "abs(y"}, r"data\.noise\.scale\.y: this is not a formula"),
-        ({"y": None}, r"data\.noise\.scale\.y: no expression\. Write one"),
-        ({"y": 0}, r"data\.noise\.scale\.y: 0 is not allowed, only a positive number"),
+        ({"y": None}, r"data\.noise\.scale\.y: None is not allowed, only an expression of the row or a positive number"),
+        ({"y": 0}, r"data\.noise\.scale\.y: 0 is not allowed, only an expression .* 0\.01 \+ 0\.05\*abs\(y\), or leave y"),
+        ({"y": [1, 2]}, r"data\.noise\.scale\.y: \[1, 2\] is not allowed, only an expression of the row or a positive number"),
         ({"y": True}, r"data\.noise\.scale\.y: True is not allowed"),
     ],
 )  # fmt: skip
@@ -195,12 +196,23 @@ def test_what_is_no_expression_is_named_before_anything_is_read(scale: object, m
         Measurements(path="a.csv", noise={"scale": scale})
 
 
+def test_what_is_no_law_is_named_as_it_was_given() -> None:
+    with pytest.raises(
+        ConfigError, match=r"data\.noise\.law: \['gaussian'\] is not allowed, only auto or gaussian or student_t"
+    ):
+        Measurements(path="a.csv", noise={"law": ["gaussian"]})
+
+
 def test_only_what_has_noise_has_a_scale() -> None:
     config = Measurements(path="a.csv", noise={"scale": {"ww": "1"}})
     with pytest.raises(
-        ConfigError, match=r"data\.noise\.scale\.ww: the simulator has no such quantity .* Did you mean w"
+        ConfigError, match=r"data\.noise\.scale\.ww: the simulator has no such state or output .* Did you mean w"
     ):
         config.check_names(("phi", "w", "q", "u"), ("phi", "w", "q"))
+    with pytest.raises(
+        ConfigError, match=r"data\.noise\.scale\.u: u is an input; only states and outputs are measured"
+    ):
+        Measurements(path="a.csv", noise={"scale": {"u": 1}}).check_names(("w", "u"), ("w",))
     with pytest.raises(ConfigError, match=r"data\.noise\.scale\.w: w was not measured, so that it has no noise"):
         noise_scale_of({"w": "1"}, TURNING, ("w",))
 

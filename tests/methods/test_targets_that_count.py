@@ -5,9 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
+from scipy.stats import multivariate_normal
 from test_methods import FIXED, GRID, NOISE, SMALL, N, X, prior_of, problem_of, run, setting_of
 
+from simpel_cli.inference.networks import MLP
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Problem
 from simpel_cli.methods.exact_gp import ExactGP
@@ -18,8 +21,11 @@ from simpel_cli.methods.pathwise import Pathwise
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
 from simpel_cli.priors.function_prior import GPPrior
+from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.marginal_likelihood import best_scales, weighted_spectra
 from simpel_cli.priors.noise_law import Moments
 
+KEY = jax.random.key(0)
 WHITE = np.random.default_rng(1).normal(size=(N, 1))
 Y = 1.2 * X + 0.3 + NOISE * (WHITE - WHITE.mean()) / WHITE.std()
 
@@ -97,6 +103,70 @@ def test_a_target_that_hardly_counts_drags_nothing(name: str) -> None:
     near = np.abs(GRID[:, 0]) < 1.5
     assert np.max(np.abs(np.asarray(found.mean) - (1.2 * GRID + 0.3))[near]) < 0.15
     assert float(found.noise_std[0]) < 1.6 * NOISE
+
+
+COUNTS, MODEL_ERROR, KAPPA = np.where(np.arange(N) % 3 == 0, 0.05, 1.5), 0.2**2, 0.4
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return KAPPA**2 * oracles.squared_exponential(a[:, 0], b[:, 0], 1.0)
+
+
+def test_white_model_error_does_not_shrink_with_the_weight_of_a_gps_row() -> None:
+    """y ~ N(g, kappa^2 K + w I + sigma^2 W^-1) about the simulator that was identified, in closed form."""
+    y = Y + 0.2 * np.random.default_rng(3).normal(size=Y.shape)
+    setting = setting_of(prior_of(True)._replace(draws=128, white_variance=MODEL_ERROR))
+    problem = counting(problem_of(y, KAPPA), COUNTS, np.ones(N))
+    rule = ExactGP(SysID(noise=FIXED), particles=200).bind(setting, problem)
+    state = run(rule, 1)
+    found = rule.predict(state, jnp.asarray(GRID))
+    a, b = np.asarray(state.phi)
+    seen = apart(X, X) + np.diag(MODEL_ERROR + NOISE**2 / COUNTS)
+    gain = np.linalg.solve(seen, apart(X, GRID)).T
+    np.testing.assert_allclose(found.mean, a * GRID + b + gain @ (y - a * X - b), atol=2e-5)
+    spread = np.diag(apart(GRID, GRID) - gain @ apart(X, GRID)) + MODEL_ERROR
+    np.testing.assert_allclose(found.epistemic_std[:, 0], np.sqrt(spread), rtol=2e-3)
+
+
+def test_nor_with_that_of_a_path() -> None:
+    y = Y + 0.2 * np.random.default_rng(3).normal(size=Y.shape)
+    method = Pathwise(particles=2500, noise=FIXED, network=MLP((2,)), batch=4, pool=32, features=500)
+    prior = prior_of(True)._replace(draws=7000, white_variance=MODEL_ERROR)
+    rule = method.bind(setting_of(prior), counting(problem_of(y, KAPPA), COUNTS, np.ones(N)))
+    state = rule.init(KEY)
+    h = np.asarray(rule.draw(jax.random.fold_in(KEY, 1), state).h)[:, 32 : 32 + N, 0]
+
+    law = 3.0 * X @ X.T + 0.25 + apart(X, X)
+    gain = np.linalg.solve(law + np.diag(MODEL_ERROR + NOISE**2 / COUNTS), law).T
+    np.testing.assert_allclose(h.mean(axis=0), (gain @ y)[:, 0], atol=0.02)
+    np.testing.assert_allclose(h.std(axis=0), np.sqrt(np.diag(law - gain @ law)), rtol=0.1)
+
+
+def test_nor_in_the_marginal_likelihood_of_the_noise() -> None:
+    """Sigma at which the penalised marginal likelihood is largest, by a fine grid of it."""
+    random = np.random.default_rng(5)
+    law = apart(X, X)
+    samples, counts = np.zeros((2, N, 1)), COUNTS[:, None]
+    truth = law + np.diag(MODEL_ERROR + NOISE**2 / COUNTS)
+    y = np.linalg.cholesky(truth) @ random.normal(size=(N, 1))
+    moments = Moments(samples, law / KAPPA**2, y, MODEL_ERROR, counts)
+    found = marginal_likelihood_scales(*moments.whitened(0), 0.3, moments.white_of(0), KAPPA).noise
+    levels = np.geomspace(0.01, 1, 2001)
+    minus = [
+        -multivariate_normal(np.zeros(N), law + np.diag(MODEL_ERROR + sigma**2 / COUNTS)).logpdf(y[:, 0])
+        + 0.5 * np.log(sigma / 0.3) ** 2
+        for sigma in levels
+    ]
+    assert found == pytest.approx(levels[int(np.argmin(minus))], rel=5e-3)
+    free = marginal_likelihood_scales(*moments.whitened(0), 0.3, moments.white_of(0))
+    assert 0.3 * KAPPA < free.gap < 2 * KAPPA
+    problem = counting(problem_of(y, KAPPA), COUNTS, np.ones(N))
+    spectra = weighted_spectra(
+        jnp.asarray(np.pad(law / KAPPA**2, (0, problem.x.shape[0] - N))), problem.y, problem.m, problem.weights, None,
+        problem.gap_scale, MODEL_ERROR,
+    )  # fmt: skip
+    best = best_scales(spectra, jnp.ones(1), 0.0, 1.0, np.full(1, 0.01), np.full(1, 0.3))
+    assert float(best.noise[0]) == pytest.approx(found, rel=0.08)  # of levels a ninth apart
 
 
 def test_moments_are_those_of_the_rows_that_tell() -> None:

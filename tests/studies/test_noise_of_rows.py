@@ -191,7 +191,7 @@ def test_what_is_wrong_is_said_with_its_cure(runs: Path) -> None:
         assert message in done.err
     done = fit(runs, "wrong", "height", "data.noise.scale={x: '1'}")
     assert done.code == 2
-    assert "data.noise.scale.x: the simulator has no such quantity (it has: y)" in done.err
+    assert "data.noise.scale.x: x is an input; only states and outputs are measured with noise." in done.err
 
 
 def test_states_that_move(tmp_path: Path) -> None:

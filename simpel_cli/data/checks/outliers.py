@@ -5,7 +5,10 @@
 
 A value is left out if |d| is far beyond what is usual for the channel, and neither the rows before it nor those after it
 lead there. A jump, an impact, a stop or a switched input has two sides, and each of its values belongs to one of them.
-Values that a spike of an input may have caused are not tested.
+Values that a spike of an input may have caused are not tested. Where the scale s[k] of the noise goes with the row, d[k] is
+compared with what is usual for the noise that it has,
+
+    (s[k]^2 + (s[k-2]^2 + 16 s[k-1]^2 + 16 s[k+1]^2 + s[k+2]^2)/36)/(70/36),    1 where s is 1
 
 Reference: Hampel (1974), The influence curve and its role in robust estimation (median absolute deviation).
 """
@@ -25,12 +28,15 @@ EXTRAPOLATE = {1: (2.0, -1.0), 2: (3.0, -3.0, 1.0), 3: (4.0, -6.0, 4.0, -1.0)}  
 KICK = 0.2  # of the span of an input: a smaller change is no spike
 
 
-def lone_values(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+def lone_values(
+    pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray], scales: Sequence[np.ndarray] | None = None
+) -> list[np.ndarray]:
     """Find values of one channel that stand alone.
 
     Args:
         pieces: contiguous rows at equal steps, angles unwrapped, each (T,).
         inputs: of the same rows, held from a row to the next, each (T, nu).
+        scales: of the noise of every value over the typical one, each (T,); None: it is the same in every row.
 
     Returns:
         A mask (T,) per piece.
@@ -41,8 +47,9 @@ def lone_values(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> l
     if not pieces:
         return found
     step = quantum(pieces)
+    loud = [np.ones(len(piece)) for piece in pieces] if scales is None else [_of_middle(scale) for scale in scales]
     for _ in range(PASSES):
-        news = _one_pass(pieces, blind, 0.0 if np.isnan(step) else step)
+        news = _one_pass(pieces, blind, loud, 0.0 if np.isnan(step) else step)
         if not any(new.any() for new in news):
             break
         for piece, mask, new in zip(pieces, found, news, strict=True):
@@ -51,17 +58,22 @@ def lone_values(pieces: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> l
     return found
 
 
-def _one_pass(pieces: Sequence[np.ndarray], blind: Sequence[np.ndarray], step: float) -> list[np.ndarray]:
+def _one_pass(
+    pieces: Sequence[np.ndarray], blind: Sequence[np.ndarray], loud: Sequence[np.ndarray], step: float
+) -> list[np.ndarray]:
     middle = [_middle(piece) for piece in pieces]
-    usual = max(_usual(middle), step)
+    usual = max(_usual([d / own for d, own in zip(middle, loud, strict=True)]), step)
     sides = {m: [(_side(p, w), _side(p[::-1], w)[::-1]) for p in pieces] for m, w in EXTRAPOLATE.items()}
     # noise asks for a low order, a fast motion for a high one
     order = min(sides, key=lambda m: _usual([left for left, _ in sides[m]]))
     if not usual > 0:
         return [np.zeros(len(p), bool) for p in pieces]
     return [
-        (np.abs(d) > FAR * usual) & ~unseen & _leads_elsewhere(left, d) & _leads_elsewhere(right[::-1], d[::-1])[::-1]
-        for d, (left, right), unseen in zip(middle, sides[order], blind, strict=True)
+        (np.abs(d) > FAR * np.maximum(usual * own, step))
+        & ~unseen
+        & _leads_elsewhere(left, d)
+        & _leads_elsewhere(right[::-1], d[::-1])[::-1]
+        for d, (left, right), unseen, own in zip(middle, sides[order], blind, loud, strict=True)
     ]
 
 
@@ -71,6 +83,15 @@ def _middle(y: np.ndarray) -> np.ndarray:
     if len(y) > 4:
         d[2:-2] = y[2:-2] - (-y[:-4] + 4 * y[1:-3] + 4 * y[3:-1] - y[4:]) / 6
     return d
+
+
+def _of_middle(scale: np.ndarray) -> np.ndarray:
+    """Scale of what `_middle` has of noise, over that of noise of scale 1; at the ends, where it is 0, 1."""
+    found, square = np.ones(len(scale)), scale**2
+    if len(scale) > 4:
+        around = square[:-4] + 16 * square[1:-3] + 16 * square[3:-1] + square[4:]
+        found[2:-2] = np.sqrt((square[2:-2] + around / 36) / (70 / 36))
+    return found
 
 
 def _side(y: np.ndarray, weights: Sequence[float]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 A value is left out of the filter on trial. It stays out if it is far from what all other rows say of it,
 
-    e_s = e - c (x_s - x_p),    var e_s = c P_s c' + r^2,    |e_s| > FAR standard deviations,
+    e_s = e - c (x_s - x_p),    var e_s = c P_s c' + r^2/ok,    |e_s| > FAR standard deviations,
 
 with the smoothed state x_s, and if the next two rows are as expected without it. A jump, an impact or a wrong model
 stays wrong in the next row, and is left alone. Standard deviations hold the process noise that a wrong model asks for.
@@ -40,7 +40,7 @@ def gated(assessor: Assessor, z: np.ndarray, windows: Windows) -> Windows:
         if not suspects.any():
             break
         trial = windows._replace(ok=np.where(suspects, 0.0, windows.ok))
-        alone = suspects & _stands_alone(assessor, z, trial)
+        alone = suspects & _stands_alone(assessor, z, trial, windows.ok)
         if not alone.any():
             break
         windows = windows._replace(ok=np.where(alone, 0.0, windows.ok))
@@ -59,8 +59,15 @@ def _suspects(assessor: Assessor, z: np.ndarray, windows: Windows) -> np.ndarray
     return first
 
 
-def _stands_alone(assessor: Assessor, z: np.ndarray, windows: Windows) -> np.ndarray:
-    """Whether each value, were it left out, is far from what the others say, and these agree, (W, T, ny)."""
+def _stands_alone(assessor: Assessor, z: np.ndarray, windows: Windows, ok: np.ndarray) -> np.ndarray:
+    """Whether each value, were it left out, is far from what the others say, and these agree, (W, T, ny).
+
+    Args:
+        assessor: of the models.
+        z: unit coordinates of the calibrated simulator.
+        windows: without the suspects.
+        ok: how much each value counts that is not left out: its noise has the variance r^2/ok.
+    """
     track = assessor(z, windows).track
     try:
         smoothed = smooth(track)
@@ -69,7 +76,7 @@ def _stands_alone(assessor: Assessor, z: np.ndarray, windows: Windows) -> np.nda
     r = np.asarray(assessor.plan.coordinates.physical(jnp.asarray(z))[1].r)
     moved = np.einsum("wtji,wti->wtj", track.slope, smoothed.mean - track.predicted)
     spread = np.einsum("wtji,wtik,wtjk->wtj", track.slope, smoothed.cov, track.slope)
-    distance = np.abs(track.innovation - moved) / np.sqrt(np.maximum(spread, 0.0) + r**2)
+    distance = np.abs(track.innovation - moved) / np.sqrt(np.maximum(spread, 0.0) + r**2 / np.where(ok > 0, ok, 1.0))
     counts = windows.ok > 0
     fine = ~counts | (np.abs(track.innovation) / np.sqrt(track.variance) < FINE)
     settled = np.ones_like(fine)

@@ -42,7 +42,8 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     """Take computed columns, values at the ends of sensors, and lone values out.
 
     Args:
-        recording: as it was read.
+        recording: as it was read; where its values count by the scale of their noise (`Episode.weight`), one is no lone value
+            for noise that it is declared to have.
         model: names the channels.
         declared_noise: channels whose noise the user declared; that of others is estimated anew without lone values.
 
@@ -59,7 +60,8 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     inputs = [e.inputs for episodes in splits.values() for e in episodes]
     for name in names:
         pieces = [column(e, name, recording, model) for episodes in splits.values() for e in episodes]
-        masks = _lone(pieces, inputs)
+        scales = [_scale(e, name, recording, model) for episodes in splits.values() for e in episodes]
+        masks = _lone(pieces, inputs, scales)
         share = sum(int(m.sum()) for m in masks) / max(sum(len(m) for m in masks), 1)
         if share > MOST_SHARE:
             too_many[name] = share
@@ -78,7 +80,15 @@ def cleaned(recording: Recording, model: Model, declared_noise: Collection[str])
     return Cleaned(clean, tuple(left_out), too_many)
 
 
-def _lone(pieces: list[np.ndarray], inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _scale(episode: Episode, name: str, recording: Recording, model: Model) -> np.ndarray:
+    """Scale of the noise of one channel over the typical one, (T,)."""
+    if episode.weight is None:
+        return np.ones(len(episode.time))
+    weight = episode.weight[:, [*(q.name for q in model.states), *recording.outputs].index(name)]
+    return np.asarray(weight**-0.5)
+
+
+def _lone(pieces: list[np.ndarray], inputs: list[np.ndarray], scales: list[np.ndarray]) -> list[np.ndarray]:
     """Find lone values beside what is missing, which is taken for the straight line between its neighbours.
 
     Of a channel that is missing in many rows none is looked for: the filter's own test of outliers comes later.
@@ -86,11 +96,11 @@ def _lone(pieces: list[np.ndarray], inputs: list[np.ndarray]) -> list[np.ndarray
     known = [np.isfinite(p) for p in pieces]
     missing = 1 - sum(int(k.sum()) for k in known) / max(sum(map(len, known)), 1)
     if missing == 0:
-        return lone_values(pieces, inputs)
+        return lone_values(pieces, inputs, scales)
     if missing > MOST_MISSING or not all(k.any() for k in known):
         return [np.zeros(len(p), bool) for p in pieces]
     filled = [np.interp(np.arange(len(p)), np.flatnonzero(k), p[k]) for p, k in zip(pieces, known, strict=True)]
-    return [mask & k for mask, k in zip(lone_values(filled, inputs), known, strict=True)]
+    return [mask & k for mask, k in zip(lone_values(filled, inputs, scales), known, strict=True)]
 
 
 def without_computed(recording: Recording, model: Model) -> Recording:
@@ -134,7 +144,13 @@ def without_ends(recording: Recording) -> Recording:
         return e._replace(outputs=np.where(e.beyond[:, e.states.shape[1] :] != 0, np.nan, e.outputs))
 
     train, test = (tuple(map(within, episodes)) for episodes in (recording.train, recording.test))
-    return recording._replace(train=train, test=test)
+    if not any(e.beyond is not None and (e.beyond != 0).any() for e in (*recording.train, *recording.test)):
+        return recording._replace(train=train, test=test)
+    checks = tuple(
+        c._replace(detail=f"{c.detail}; discover leaves these values out") if c.name == "saturation" else c
+        for c in recording.checks
+    )
+    return recording._replace(train=train, test=test, checks=checks)
 
 
 def refuse_noise(recording: Recording, model: Model) -> None:

@@ -1,0 +1,103 @@
+"""Rows whose stamps stray are moved to even ones: values of the exact motion there, and fits as good as of even stamps."""
+
+import numpy as np
+import pytest
+from test_filter_clock import DT, A, B, model, motion
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.filtering.estimated_rows import needed, whole, with_estimates
+from simpel_cli.filtering.even_rows import even_times, inputs_at, moved, uneven
+
+NOISE, ROWS = 0.01, 60
+CHECKS = (Check("jitter", False, "38 % of the steps differ; data.resample: 0.2 makes them equal"),)
+
+
+def recorded(jitter: float, seed: int = 3) -> Recording:
+    """Six episodes of the plant, driven by an input that is held for three rows; stamps stray by so much of a row."""
+    random, made = np.random.default_rng(seed), []
+    for k in range(6):
+        time = np.arange(ROWS) * DT + jitter * DT * random.uniform(-1, 1, ROWS)
+        u = np.repeat(random.normal(size=ROWS // 3), 3)
+        measured = motion(time, u, time) + NOISE * random.normal(size=(ROWS, 2))
+        made.append(Episode(f"{k}", time, measured, u[:, None], np.zeros((ROWS, 0))))
+    noise = {"s": NOISE, "v": NOISE}
+    return Recording(tuple(made[:5]), tuple(made[5:]), (), noise, (), CHECKS, ())
+
+
+@pytest.fixture(scope="module")
+def strayed() -> tuple[Recording, Recording]:
+    given = recorded(0.2)
+    return given, with_estimates(given, model(), ("s", "v"))
+
+
+def test_only_rows_that_stray_are_moved(strayed: tuple[Recording, Recording]) -> None:
+    given, found = strayed
+    assert whole(given)
+    assert needed(given, model())
+    assert not needed(recorded(0.0), model())
+    assert not needed(found, model())
+    assert not needed(
+        given._replace(
+            train=(given.train[0].__class__("a", *(a if a is None else a[:9] for a in given.train[0][1:])),)
+        ),
+        model(),
+    )
+
+
+def test_values_are_those_of_the_motion_at_even_rows(strayed: tuple[Recording, Recording]) -> None:
+    given, found = strayed
+    kept, straying = [], []
+    for before, after in zip((*given.train, *given.test), (*found.train, *found.test), strict=True):
+        assert np.ptp(np.diff(after.time)) < 1e-9
+        np.testing.assert_allclose(after.time, before.time, atol=0.25 * DT)
+        inside = (after.time > before.time[0]) & (after.time < before.time[-1])
+        true = motion(before.time, before.inputs[:, 0], after.time[inside])
+        kept.append(after.states[inside] - true)
+        straying.append(before.states[inside] - true)
+        assert after.weight is None
+    assert np.sqrt(np.mean(np.square(np.concatenate(kept)))) < 1.3 * NOISE
+    assert np.sqrt(np.mean(np.square(np.concatenate(straying)))) > 2 * NOISE
+    (jitter,) = found.checks
+    assert jitter.ok
+    assert "values moved to even rows" in jitter.detail
+    assert "resample" not in jitter.detail
+
+
+def fitted(recording: Recording) -> tuple[np.ndarray, float]:
+    """Least squares of one step of the exact plant: error of (a, b), and root mean square one step ahead, noise and all."""
+    rows = [(e.states[:-1], e.inputs[:-1, 0], e.states[1:]) for e in recording.train]
+    x, u, after = (np.concatenate(column) for column in zip(*rows, strict=True))
+    slopes, *_ = np.linalg.lstsq(np.stack([x[:, 1], u], axis=1), after[:, 1], rcond=None)
+    a = -np.log(slopes[0]) / DT
+    b = slopes[1] * a / (1 - slopes[0])
+    return np.array([a - A, b - B]), float(np.std(after[:, 1] - np.stack([x[:, 1], u], axis=1) @ slopes))
+
+
+def test_a_fit_is_as_good_as_one_of_even_stamps(strayed: tuple[Recording, Recording]) -> None:
+    given, found = strayed
+    even, strays, moved_there = (fitted(r) for r in (recorded(0.0), given, found))
+    print("errors of a, b and one step ahead: even", even, "as they are", strays, "moved", moved_there)
+    assert moved_there[1] < 1.3 * even[1] < 0.6 * strays[1]
+    assert np.abs(moved_there[0]).max() < 0.03
+
+
+def test_inputs_and_shifts_in_closed_form() -> None:
+    time = np.array([0.0, 1.2, 1.9, 3.1])
+    to = np.array([0.0, 1.0, 2.0, 3.0])
+    u = np.array([[1.0], [3.0], [-1.0], [2.0]])
+    np.testing.assert_allclose(inputs_at(time, to, u, ())[:, 0], [1.0, 0.2 + 0.7 * 3 - 0.1, -1.0, -0.1 + 0.9 * 2])
+    np.testing.assert_allclose(inputs_at(time, to, 2 * time[:, None], (0,))[:, 0], 2 * to)
+
+    def exact(at: np.ndarray) -> np.ndarray:
+        """Of dx/dt = u, with u held, and of dx/dt = 2 t, the same with a linear input."""
+        held = np.interp(at, time, np.append(0.0, np.cumsum(u[:-1, 0] * np.diff(time))))
+        return np.stack([held, at**2], axis=1)
+
+    both = np.concatenate([u, 2 * time[:, None]], axis=1)
+    shift = moved(time, to, exact(time), both, (1,), lambda x, u: u)
+    np.testing.assert_allclose(exact(time) + shift, exact(to), atol=1e-12)
+    nothing = moved(time, to, exact(time), both, (1,), lambda x, u: 0 * u)  # straight between what is known
+    np.testing.assert_allclose((exact(time) + nothing)[:, 0], exact(to)[:, 0], atol=1e-12)
+    np.testing.assert_allclose(even_times(5 + 0.1 * np.arange(9.0)), 5 + 0.1 * np.arange(9.0))
+    even = Episode("e", np.arange(50) * 0.1, np.zeros((50, 1)), np.zeros((50, 1)), np.zeros((50, 0)))
+    assert not uneven([even], 0.1)
