@@ -1,34 +1,44 @@
 """What inputs do between rows, asked of planted data where neither simulator nor data say."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.between_rows import in_words, preferences, settled, words_of
+from simpel_cli.discovery.search.between_rows import asked_beside, in_words, preferences, settled, words_of
+from simpel_cli.discovery.search.calibration import prepared
+from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.likelihood.fit import Fitter
-from simpel_cli.filtering.setup import questions, setup
+from simpel_cli.filtering.setup import Setup, questions, setup, terms_of
+from simpel_cli.runs.console import Terminal
+from simulators.effects import Expression
 from simulators.model import Declared, Model
 from simulators.worlds.simulate import Simulate
 
 NOISE = 0.003
+DRAG = Expression(
+    "drag", acts_on="w", term="-k*w**3", parameters={"k": {"range": [0, 2], "unit": "1", "starts": [0.2]}}
+)
+OPTIONS = Discovery(substeps=2, lanes=2)
 
 
-def rotor(**between_rows: str) -> Model:
+def rotor(more: str = "", **between_rows: str) -> Model:
     words = {name: {"between_rows": word} for name, word in between_rows.items()}
     return Declared(
         "rotor", dt=0.1, substeps=4, states={"w": {"unit": "rad/s", "range": [-3, 3]}},
         inputs={name: {"unit": "V", "range": [-2, 2], **words.get(name, {})} for name in ("u", "v")},
         parameters={"a": {"unit": "1/s", "range": [0.5, 4]}, "b": {"unit": "rad/s^2/V", "range": [0.5, 4]}},
-        dynamics={"w": "b*u + 0.8*b*v - a*w"},
+        dynamics={"w": f"b*u + 0.8*b*v - a*w{more}"},
     ).model()  # fmt: skip
 
 
-def recording(seed: int, **truth: str) -> Recording:
+def recording(seed: int, more: str = "", **truth: str) -> Recording:
     made = Simulate(
         episodes=4, steps=80, seed=seed, noise_std={"w": NOISE}, truth={"a": 2.0, "b": 1.5}, between_rows=truth,
         initial={"w": [-1, 1]}, test_fraction=0.0,
-    ).run(rotor()).columns  # fmt: skip
+    ).run(rotor(more)).columns  # fmt: skip
     episodes = []
     for k in range(4):
         own = made["episode"] == k
@@ -72,3 +82,41 @@ def test_what_is_declared_is_not_asked() -> None:
     found, _ = asked(rotor(u="linear"), recording(2, u="linear"))
     assert list(found) == ["v"]
     assert found["v"].word == "held"
+
+
+def attached(model: Model, data: Recording, **terms) -> Setup:
+    return setup(model, data, (), [DRAG], OPTIONS.substeps, **terms)
+
+
+def search_of(plan: Setup) -> Search:
+    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8))
+
+
+def test_the_whole_program_takes_the_answer_as_said_and_begins_where_the_small_one_ended() -> None:
+    data, model = recording(3, u="linear"), rotor()
+    plan, kept, found = prepared(
+        partial(attached, data=data), model, terms_of(model, data, [DRAG]), OPTIONS, Terminal(quiet=True)
+    )
+    assert kept is None
+    assert words_of(found) == {"u": "linear", "v": "held"} == plan.augmented.model.between_rows
+    assert {t.effect for t in plan.augmented.terms} == {"drag", "unnamed"}  # nothing is asked in it
+    everywhere = search_of(plan._replace(optimum=None)).base().optimum
+    assert search_of(plan).base().optimum.log_evidence == pytest.approx(everywhere.log_evidence, abs=0.05)
+    assert plan.optimum is not None
+    np.testing.assert_allclose(plan.optimum[:2], everywhere.z[:2], atol=1e-3)
+
+
+def test_beside_an_effect_the_question_is_asked_anew() -> None:
+    """A drag that the simulator lacks hides what the input does; taken for held, the model chosen beside it is asked."""
+    data, model = recording(4, " - 0.6*w**3", u="linear", v="held"), rotor()
+    held = attached(rotor(u="held", v="held"), data)
+    search = search_of(held)
+    base = search.base()
+    (drag,) = (i for i, t in enumerate(search.terms) if t.effect == "drag")
+    chosen = search.add(base, [drag]).trials[0]
+    alone, _ = asked(model, data)
+    beside = asked_beside(partial(attached, data=data), model, search, chosen, 2)
+    assert words_of(beside) == {"u": "linear", "v": "held"}
+    print({n: p.gain for n, p in alone.items()}, {n: p.gain for n, p in beside.items()})
+    assert beside["u"].gain > 50
+    assert beside["u"].gain > abs(alone["u"].gain)
