@@ -78,6 +78,8 @@ class Measurements:
         sensor: state or output -> `{saturates: [low, high]}`, what its sensor records at most, in its unit; null: no end. A
             value at an end says that the quantity is there or beyond: of an output it is trained on and scored as that, of a
             state it is a missing value, and so it is of both in `discover`.
+        groups: columns that name groups of episodes, e.g. the ball, the payload, the subject: `discover` asks by itself whether
+            an effect that it chose differs from group to group.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.
@@ -106,6 +108,7 @@ class Measurements:
     times: Mapping[str, str] = field(default_factory=dict)
     join: tuple[Mapping[str, Any], ...] = ()
     sensor: Mapping[str, Any] = field(default_factory=dict)
+    groups: tuple[str, ...] = ()
 
     sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields whose type says too little
         "layout": {"enum": list(LAYOUTS)},
@@ -157,6 +160,12 @@ class Measurements:
         _one_of("noise.law", self.noise.get("law", "auto"), LAWS)
         for name, word in self.between_rows.items():
             _one_of(f"between_rows.{name}", word, BETWEEN_ROWS)
+        if not isinstance(self.groups, list | tuple) or not all(
+            isinstance(c, str) and c.isidentifier() for c in self.groups
+        ):
+            raise ConfigError(
+                f"data.groups: {self.groups!r} is not allowed, only a list of names of columns (letters, digits, underscores)."
+            )
         _check_split(self.split)
         read_latency(self.latency)
         read_times(self.times, self.time)

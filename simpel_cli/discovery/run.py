@@ -26,6 +26,8 @@ from simpel_cli.discovery.search.between_rows import (
     words_of,
 )
 from simpel_cli.discovery.search.calibration import calibrated, prepared, with_heavy_tails
+from simpel_cli.discovery.search.grouping import Grouping, grouped_effects, groupings
+from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
@@ -48,7 +50,7 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import members, setup, terms_of
+from simpel_cli.filtering.setup import MOST_GROUPED, members, setup, terms_of
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
@@ -77,6 +79,7 @@ class Searched(NamedTuple):
         recording: the measurements that were searched in, with what was found in them.
         between_rows: input -> what it does between rows, where neither simulator nor data say.
         degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
+        groupings: what it is worth that a chosen effect differs from group to group.
     """
 
     search: Search
@@ -88,6 +91,7 @@ class Searched(NamedTuple):
     recording: Recording
     between_rows: dict[str, Preference]
     degrees_of_freedom: dict[str, float]
+    groupings: list[Grouping]
 
 
 def discover(job: Job, publish: Publish, *, strict: bool = False) -> None:
@@ -128,7 +132,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     if latencies:
         declared = _with_latencies(declared, latencies)
         study = open_study(declared, data_folder, whole=False)
-    searched = _search(study, terminal)
+    searched = _with_groups(study, _search(study, terminal), terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
     found = _verdict(searched, before, after, began)
@@ -198,6 +202,23 @@ def _with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
     return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
 
 
+def _with_groups(study: Study, searched: Searched, terminal: Terminal) -> Searched:
+    """Search once more with the effects that differ from group to group, as long as that pays; return what was found last."""
+    for _ in range(MOST_GROUPED):
+        declared = study.declared
+        effects = grouped_effects(declared.groups["effect"], searched.groupings)
+        if effects == declared.groups["effect"]:
+            break
+        terminal.line("searching once more with it", "groups")
+        study = study._replace(declared=declared._replace(groups=declared.groups | {"effect": effects}))
+        again = _search(study, terminal)
+        if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
+            break
+        known = {(g.effect, g.per): g for g in (*searched.groupings, *again.groupings)}
+        searched = again._replace(groupings=list(known.values()))
+    return searched
+
+
 def _search(study: Study, terminal: Terminal) -> Searched:
     """Clean the measurements, calibrate the simulator, choose effects, and accept those that help on held-out episodes."""
     model, groups = study.system.source, study.declared.groups
@@ -250,15 +271,17 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
+    asked = groupings(search, assessor, selection.chosen, effects, attach_said, options, terminal)
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(
-        search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom
-    )
+        search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
+        asked,
+    )  # fmt: skip
 
 
 def _verdict(searched: Searched, before: Assessment, after: Assessment, began: float) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
-    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu = searched
+    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked = searched
     left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
     seconds = time.perf_counter() - began
     found = verdict_of(
@@ -266,11 +289,18 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, began: f
     )
     found["between_rows"] = {name: p._asdict() for name, p in between_rows.items()}
     found["degrees_of_freedom"] = nu
+    found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
-    found["summary"] += of_groups(found["groups"]) + sentence_of(between_rows) + sentence_of_tails(nu) + caveats(found)
+    found["summary"] += (
+        of_grouping(asked)
+        + of_groups(found["groups"])
+        + sentence_of(between_rows)
+        + sentence_of_tails(nu)
+        + caveats(found)
+    )
     return found
 
 

@@ -21,7 +21,7 @@ from simpel_cli.inference import student_t
 from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
-from simpel_cli.methods.sysid import SysID, identified, simulator_of
+from simpel_cli.methods.sysid import Identified, SysID, identified, simulator_of
 from simpel_cli.priors.gaussian_process import gram
 from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, weighted_spectra
 
@@ -29,7 +29,7 @@ from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, weighte
 class State(NamedTuple):
     """Everything that the training data say: parameters, residuals, noise."""
 
-    phi: Float[Array, " dp"]
+    found: Identified
     data: Spectrum
     noise_std: Float[Array, " dy"]
     loss: Float[Array, ""]
@@ -41,7 +41,8 @@ class ExactGP:
 
     Args:
         sysid: how the simulator is calibrated.
-        particles: of the mixture that stands for the Gaussian predictive, L: its quantiles.
+        particles: of the mixture that stands for the Gaussian predictive, L: its quantiles; for a group that was never seen
+            each has a draw of the population.
     """
 
     sysid: SysID = SysID()
@@ -86,9 +87,9 @@ class ExactGP:
             return (scale.x(x) * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
 
         def init(key: PRNGKeyArray) -> State:
-            phi = identified(self.sysid, setting, problem, key)
+            found = identified(self.sysid, setting, problem, key, self.particles)
             known = scaled(problem.x)
-            left = jnp.asarray(problem.y) - simulated(phi, problem.x)
+            left = jnp.asarray(problem.y) - simulated(found.phi, problem.x)
             correlation = gram(kernel, known, known)
             data = weighted_spectra(correlation, left, problem.m, problem.weights, None, kappa, white)
             telling = data
@@ -99,7 +100,7 @@ class ExactGP:
             scales, left_over = (kappa, white) if problem.weights is None else (jnp.ones_like(kappa), 0.0)
             best = best_scales(telling, scales, left_over, prior_std, problem.noise_floor, problem.noise_init)
             return State(
-                phi,
+                found,
                 data,
                 best.noise.astype(dtype),
                 (jnp.sum(best.loss) / jnp.maximum(jnp.sum(counts), 1)).astype(dtype),
@@ -111,7 +112,7 @@ class ExactGP:
             )
 
         def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
-            """Mean and standard deviation of the function, normalised."""
+            """Mean and standard deviation of what the simulator leaves, normalised."""
             known, data = gram(kernel, scaled(x), scaled(problem.x)) * counts[None], state.data
             if problem.weights is None:  # one basis serves all outputs
                 values, reach, turned, own = data.values, known @ data.vectors, data.turned.T, None
@@ -135,7 +136,7 @@ class ExactGP:
 
             each = jax.vmap(of_output, in_axes=(0, 0, own, own, 0), out_axes=1)
             mean, std = each(kappa, state.noise_std, values, reach, turned)
-            return simulated(state.phi, x) + mean.astype(dtype), std.astype(dtype)
+            return mean.astype(dtype), std.astype(dtype)
 
         def quantiles() -> Float[Array, "L dy"]:
             """Standard normal quantiles of unit variance, in another order for every output, so that they are independent."""
@@ -146,14 +147,16 @@ class ExactGP:
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             mean, std = predicted(state, x)
-            h = mean[None] + quantiles()[:, None] * std[None]
+            g = jax.vmap(simulated, in_axes=(0, None))(state.found.each, x)
+            h = g + mean[None] + quantiles()[:, None] * std[None]
             return Predictive(scale.y_to_data(h), state.noise_std * scale.y_std, problem.tails)
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
-            def one(x: Float[Array, "n dx"], q: Float[Array, " dy"]) -> Float[Array, "n dy"]:
+            def one(x: Float[Array, "n dx"], q: Float[Array, " dy"], phi: Float[Array, " dp"]) -> Float[Array, "n dy"]:
                 mean, std = predicted(state, x)
-                return mean + q[None] * std
+                return simulated(phi, x) + mean + q[None] * std
 
-            return scale.y_to_data(jax.vmap(one)(x, quantiles()))
+            phi = jnp.broadcast_to(state.found.each, (self.particles, *state.found.phi.shape))
+            return scale.y_to_data(jax.vmap(one)(x, quantiles(), phi))
 
         return Inference(init, lambda key, state: None, step, predict, members)

@@ -3,7 +3,8 @@
     y = g(x, phi_hat) + h~(x) + noise,    phi_hat: MAP (`sysid`),    h~: FSVGD
 
 The residual is not shifted, and scaled by what its marginal likelihood says that the simulator leaves (`prior.scale`). The
-parameters are not looked at again, so the spread of the posterior is that of the residual alone.
+parameters are not looked at again, so the spread of the posterior is that of the residual alone, but for groups that were never
+seen: every particle has its own draw of the population for them.
 
 Reference: Psichogios and Ungar (1992), A hybrid neural network - first principles approach to process modeling.
 """
@@ -19,7 +20,7 @@ from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.fsvgd import FSVGD
-from simpel_cli.methods.sysid import SysID, identified, simulator_of
+from simpel_cli.methods.sysid import Identified, SysID, identified, simulator_of
 from simpel_cli.priors.function_prior import GPPrior
 from simpel_cli.priors.marginal_likelihood import (
     MOST_ROWS,
@@ -35,14 +36,14 @@ class State(NamedTuple):
     """What the first stage found, and the networks.
 
     Args:
-        phi: identified parameters.
+        found: the identified simulator.
         simulated: what their simulator predicts of the training targets, data units.
         scale: of the residual, normalised.
         noise_floor: least noise, normalised.
         residual: state of the second stage.
     """
 
-    phi: Float[Array, " dp"]
+    found: Identified
     simulated: Float[Array, "m dy"]
     scale: Float[Array, " dy"]
     noise_floor: Float[Array, " dy"]
@@ -146,9 +147,9 @@ class GreyBox:
 
         def init(key: PRNGKeyArray) -> State:
             key_first, key_second = jax.random.split(key)
-            phi = identified(self.sysid, setting, problem, key_first)
-            predicted = simulated(phi, problem.x)
-            first = State(phi, predicted, *likely(predicted), None)
+            found = identified(self.sysid, setting, problem, key_first, self.particles)
+            predicted = simulated(found.phi, problem.x)
+            first = State(found, predicted, *likely(predicted), None)
             return first._replace(residual=second(first).init(key_second))
 
         def draw(key: PRNGKeyArray, state: State) -> Any:
@@ -160,10 +161,11 @@ class GreyBox:
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             rest = second(state).predict(state.residual, x)
-            return rest._replace(particles=rest.particles + simulated(state.phi, x)[None])
+            return rest._replace(particles=rest.particles + jax.vmap(simulated, in_axes=(0, None))(state.found.each, x))
 
         def members(state: State, x: Float[Array, "L n dx"]) -> Float[Array, "L n dy"]:
             rest = second(state).members(state.residual, x)
-            return rest + jax.vmap(lambda x: simulated(state.phi, x))(x)
+            phi = jnp.broadcast_to(state.found.each, (self.particles, *state.found.phi.shape))
+            return rest + jax.vmap(simulated)(phi, x)
 
         return Inference(init, draw, step, predict, members)

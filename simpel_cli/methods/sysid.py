@@ -3,7 +3,8 @@
     f(u, rho) = 1/2 sum_jk (y_jk - g_k(x_j, phi(u)))^2 / sigma_k^2 + m sum_k log sigma_k - log p(u) - log p(rho)
 
 by damped Fisher scoring from several draws of the prior, within the bounds of uniform priors. Effects that the simulator
-lacks stay absent: what is left is noise to it.
+lacks stay absent: what is left is noise to it. Spreads of groups have no such optimum; they are those of the largest evidence
+(`simpel_cli.methods.populations`).
 
 Reference: Levenberg (1944), Marquardt (1963); MacKay (1992), A practical Bayesian framework for backpropagation networks,
 sec. 2 (the Gaussian about the optimum).
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from simpel_cli.dynamics.transition import OneStep
 from simpel_cli.errors import ConfigError, check_at_least_one
@@ -23,6 +24,7 @@ from simpel_cli.inference import student_t
 from simpel_cli.inference.noise import NoiseModel
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
+from simpel_cli.methods.populations import Populations, Told
 from simpel_cli.priors.function_prior import WIDE, FunctionPrior
 
 FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e8
@@ -33,13 +35,40 @@ FAR = 6.0  # standard deviations of a normal prior that a parameter may go
 
 
 class State(NamedTuple):
-    """Every start of the search: unit coordinates, noise, damping, the loss there, and steps on end that gained nothing."""
+    """Every start of the search: unit coordinates, noise, damping, the loss there, and steps on end that gained nothing.
+
+    Where parameters differ from group to group: what the data tell of the groups. None: there are no groups.
+    """
 
     u: Float[Array, "S dp"]
     rho: Float[Array, "S dy"]
     damping: Float[Array, " S"]
     loss: Float[Array, " S"]
     idle: Float[Array, " S"]
+    told: Told | None = None
+
+    @property
+    def best(self) -> Int[Array, ""]:
+        """The start that counts."""
+        return jnp.argmin(self.loss if self.told is None else self.loss + self.told.paid)
+
+
+class Identified(NamedTuple):
+    """The simulator that was found, in physical units.
+
+    Args:
+        phi: most probable parameters, (dp,).
+        particles: the same for every particle, but groups that were never seen, which are drawn from the population; None:
+            there are no groups.
+    """
+
+    phi: Float[Array, " dp"]
+    particles: Float[Array, "L dp"] | None
+
+    @property
+    def each(self) -> Float[Array, "P dp"]:
+        """Parameters of every particle, of all of them where they are alike."""
+        return self.phi[None] if self.particles is None else self.particles
 
 
 @dataclass(frozen=True)
@@ -79,6 +108,7 @@ class SysID:
         dim_u, dim_y, n_rows = len(prior.params), problem.y.shape[1], problem.x.shape[0]
         low, high = (jnp.asarray(side, dtype) for side in bounds(prior))
         gaussian = jnp.asarray([q.prior != "uniform" for q in prior.params], bool)
+        populations = Populations(prior.params)
         counts = (jnp.arange(n_rows, dtype=jnp.int32) < problem.m).astype(dtype)[:, None]
 
         def simulated(u: Float[Array, " dp"], x: Float[Array, "n dx"]) -> Float[Array, "n dy"]:
@@ -129,10 +159,34 @@ class SysID:
             bend = jax.nn.sigmoid(rho) / sigma(rho)  # d log sigma / d rho
             return jax.scipy.linalg.block_diag(of_u, jnp.diag(of_log * bend**2))
 
+        def known(slope: Float[Array, "n dy dp"], rho: Float[Array, " dy"]) -> Float[Array, "dp dp"]:
+            """Information of unit coordinates in which a uniform prior knows its variance of 1/12.
+
+            Where data see nothing, a draw is spread over the range.
+            """
+            return fisher(slope, rho)[:dim_u, :dim_u] + jnp.diag(jnp.where(gaussian, 0.0, 12.0).astype(dtype))
+
+        def respread(state: State, of_f: Float[Array, "n dy dp"]) -> tuple[State, Float[Array, "n dy dp"]]:
+            """Go on with other spreads of groups where a start has come to rest with those that it had."""
+            held = (state.u <= low) | (state.u >= high)
+            told = populations.told(known(of_f, state.rho), held)
+            moved = populations.moved(state.u, told, FAR)
+            rests = (state.idle > 0) & jnp.isfinite(state.loss) & ~moved.settled
+            after = state._replace(
+                u=jnp.where(rests, moved.u, state.u),
+                loss=state.loss + jnp.where(rests, moved.loss, 0.0),
+                damping=jnp.where(rests, jnp.minimum(state.damping, FIRST_DAMPING), state.damping),
+                idle=jnp.where(rests, 0.0, state.idle),
+                told=told,
+            )
+            return after, of_f * jnp.where(rests, moved.stretch, 1.0)[None, None]
+
         def better(state: State) -> State:
             """One damped step of one start."""
-            at = jnp.concatenate([state.u, state.rho])
             f, of_f = linearised(state.u)
+            if populations:
+                state, of_f = respread(state, of_f)
+            at = jnp.concatenate([state.u, state.rho])
             by_f, by_u, by_rho = jax.grad(judged, argnums=(0, 1, 2))(f, state.u, state.rho)
             slope = jnp.concatenate([by_u + jnp.einsum("nk,nki->i", by_f, of_f), by_rho])
             edge = (
@@ -141,6 +195,8 @@ class SysID:
             )
             stuck = ((at <= edge[0]) & (slope > 0)) | ((at >= edge[1]) & (slope < 0))
             still = stuck | (jnp.arange(at.shape[0]) >= dim_u) if not self.noise.learn else stuck
+            if populations:
+                still = still | jnp.asarray(np.append(populations.held, np.zeros(dim_y, bool)))
             moves = jnp.where(still, 0.0, 1.0).astype(dtype)
             h = fisher(of_f, state.rho) * moves[:, None] * moves[None]
             h = h + jnp.diag(state.damping * jnp.diag(h) + jnp.where(still, 1.0, 1e-9 * jnp.trace(h) + 1e-12))
@@ -153,7 +209,8 @@ class SysID:
             # a step that was refused says nothing before it was tried shorter and shorter
             waited = (good | (state.damping >= HOPELESS)).astype(dtype)
             idle = jnp.where(gained, 0.0, state.idle + waited).astype(dtype)
-            return State(here[:dim_u], here[dim_u:], damping.astype(dtype), jnp.where(good, value, state.loss), idle)
+            loss_here = jnp.where(good, value, state.loss)
+            return State(here[:dim_u], here[dim_u:], damping.astype(dtype), loss_here, idle, state.told)
 
         def all_better(state: State) -> State:
             """One step of every start; starts of a wide simulator one after the other."""
@@ -168,7 +225,9 @@ class SysID:
             )
             first = jax.vmap(loss)(u, rho)
             damping = jnp.full((self.starts,), FIRST_DAMPING, dtype)
-            return State(u, rho, damping, jnp.where(jnp.isfinite(first), first, jnp.inf), jnp.zeros_like(damping))
+            none = jnp.zeros_like(damping)
+            told = Told(jnp.zeros((self.starts, len(populations.spreads)), dtype), none) if populations else None
+            return State(u, rho, damping, jnp.where(jnp.isfinite(first), first, jnp.inf), none, told)
 
         def step(key: PRNGKeyArray, state: State, draws: None) -> tuple[State, Info]:
             # a loop of one turn or none: where every start has ended, nothing is simulated, under vmap either
@@ -177,7 +236,7 @@ class SysID:
                 lambda carry: (all_better(carry[0]), jnp.zeros((), bool)),
                 (state, jnp.ones((), bool)),
             )
-            best = jnp.argmin(after.loss)
+            best = after.best
             info = Info(
                 after.loss[best] / jnp.maximum(problem.m, 1).astype(dtype),
                 student_t.standard_deviation(sigma(after.rho[best]), problem.tails),
@@ -187,21 +246,24 @@ class SysID:
 
         def drawn(state: State) -> tuple[Float[Array, "L dp"], Float[Array, " dy"]]:
             """Unit coordinates from the Gaussian about the best optimum, within bounds, and the noise."""
-            best = jnp.argmin(state.loss)
+            best = state.best
             u, rho = state.u[best], state.rho[best]
-            # a uniform prior knows its variance of 1/12: where data see nothing, a draw is spread over the range
-            h = fisher(linearised(u)[1], rho)[:dim_u, :dim_u] + jnp.diag(jnp.where(gaussian, 0.0, 12.0).astype(dtype))
+            h = known(linearised(u)[1], rho)
             held = (u <= low) | (u >= high)  # at a bound half of the mass lies beyond it: the optimum stands for it
+            if populations:
+                held = held | jnp.asarray(populations.held)
             h = jnp.where(held[:, None] | held[None], jnp.eye(dim_u, dtype=dtype), h)
             factor = jnp.linalg.cholesky(h.astype(jnp.float64)).astype(dtype)
-            white = jax.random.normal(jax.random.key(0), (self.particles, dim_u), dtype)
-            white = (white - jnp.mean(white, axis=0)[None]) * (self.particles / max(self.particles - 1, 1)) ** 0.5
+            white = white_noise(self.particles, dim_u, dtype)
             apart = jax.scipy.linalg.solve_triangular(factor, white.T, lower=True, trans=1).T
             apart = jnp.where(held[None], 0.0, apart)
             # a draw beyond a bound is shortened along its own direction: clipped, it would leave a ridge of parameters that
             # fit equally well
             room = jnp.where(apart > 0, (high - u)[None], (u - low)[None]) / jnp.maximum(jnp.abs(apart), 1e-12)
-            return u[None] + jnp.minimum(jnp.min(room, axis=1, initial=1.0), 1.0)[:, None] * apart, sigma(rho)
+            draws = u[None] + jnp.minimum(jnp.min(room, axis=1, initial=1.0), 1.0)[:, None] * apart
+            if state.told is not None:
+                draws = populations.drawn(draws, state.told.gamma[best], white)
+            return draws, sigma(rho)
 
         def predict(state: State, x: Float[Array, "n dx"]) -> Predictive:
             u, noise_std = drawn(state)
@@ -214,11 +276,26 @@ class SysID:
         return Inference(init, lambda key, state: None, step, predict, members)
 
 
-def identified(method: SysID, setting: Setting, problem: Problem, key: PRNGKeyArray) -> Float[Array, " dp"]:
-    """Return the most probable parameters, in physical units; those of a simulator without uncertain ones are none."""
+def white_noise(n: int, dim: int, dtype: jnp.dtype) -> Float[Array, "n dim"]:
+    """Return standard normal numbers whose mean is 0."""
+    white = jax.random.normal(jax.random.key(0), (n, dim), dtype)
+    return (white - jnp.mean(white, axis=0)[None]) * (n / max(n - 1, 1)) ** 0.5
+
+
+def identified(method: SysID, setting: Setting, problem: Problem, key: PRNGKeyArray, particles: int) -> Identified:
+    """Return the most probable parameters; those of a simulator without uncertain ones are none.
+
+    Args:
+        method: how it is identified.
+        setting: with the prior.
+        problem: with the data.
+        key: of the starts.
+        particles: number of particles that groups which were never seen are drawn for.
+    """
     prior, _ = simulator_of(setting)
+    dtype = problem.x.dtype
     if not prior.params:
-        return jnp.zeros((0,), problem.x.dtype)
+        return Identified(jnp.zeros((0,), dtype), None)
     rule = method.bind(setting, problem)
 
     def body(_: Array, state: State) -> State:
@@ -226,7 +303,13 @@ def identified(method: SysID, setting: Setting, problem: Problem, key: PRNGKeyAr
         return after
 
     last: State = jax.lax.fori_loop(0, method.steps, body, rule.init(key))
-    return physical(prior, last.u[jnp.argmin(last.loss)])
+    u = last.u[last.best]
+    phi = physical(prior, u)
+    if last.told is None:
+        return Identified(phi, None)
+    white = white_noise(particles, len(u), dtype)
+    draws = Populations(prior.params).drawn(jnp.tile(u[None], (particles, 1)), last.told.gamma[last.best], white)
+    return Identified(phi, jax.vmap(lambda u: physical(prior, u))(draws))
 
 
 def simulator_of(setting: Setting) -> tuple[FunctionPrior, OneStep]:

@@ -57,8 +57,10 @@ class Declared(NamedTuple):
 
     @property
     def _columns_of_groups(self) -> dict[str, str]:
-        """Columns of groups that effects name, each with the key that does."""
-        return {e.per: f"effect.{e.name}.per" for e in self.groups.get("effect") or () if e.per}
+        """Columns of groups that effects name, or the data where there are effects, each with the key that does."""
+        effects, data = self.groups.get("effect") or (), self.groups.get("data")
+        asked = data.groups if effects and isinstance(data, Measurements) else ()
+        return dict.fromkeys(asked, "data.groups") | {e.per: f"effect.{e.name}.per" for e in effects if e.per}
 
     @property
     def measurements(self) -> Measurements:

@@ -154,8 +154,7 @@ def test_what_is_wrong_with_groups_of_an_effect_names_its_key(made, tmp_path) ->
             Expression("late", acts_on="input", operator=operator, parameters={"d": {"range": [0, 1]}}, per="ball")
 
 
-def test_an_identified_simulator_knows_every_group(made) -> None:
-    """Not the spread: beside what the groups are, the most probable one is the largest."""
+def test_an_identified_simulator_knows_every_group_and_their_spread(made) -> None:
     path, truth = made
     model = slider(per="ball")
     data = recorded(path, model)
@@ -171,11 +170,13 @@ def test_an_identified_simulator_knows_every_group(made) -> None:
             keys=[jax.random.key(1)], precision="float64", law="gaussian",
         )  # fmt: skip
         problem = jax.tree.map(lambda a: a[0], done.problems)
-        found = np.asarray(identified(method, done.setting, problem, jax.random.key(2)))
+        found = np.asarray(identified(method, done.setting, problem, jax.random.key(2), 1).phi)
     values = dict(zip([q.name for q in whole.params], found, strict=True))
     for name in data.groups["ball"]:
         own = values["c"] * np.exp(values["c_spread"] * values[f"c_of_{name}"])
         assert abs(own / truth[name]["c"] - 1) < 0.1
+    logs = np.log([truth[name]["c"] for name in data.groups["ball"]])
+    assert values["c_spread"] == pytest.approx(logs.std(ddof=1), rel=0.15)
 
 
 def test_points_of_the_domain_are_of_one_group_each() -> None:

@@ -1,27 +1,21 @@
 """Fits in which groups differ: the spread of their values is chosen by the evidence, beside everything else.
 
-A spread s and what the groups are, delta_g, have no common optimum: the posterior grows without end as s falls and all delta_g
-vanish with it, or as s rises and they shrink. So a fit holds s, and s follows from where the groups came to rest
-
-    s^2 <- s^2 sum_g delta_g^2 / gamma,    gamma = sum_g (1 - var delta_g)
-
-(their posterior variance from the Laplace approximation; gamma counts the groups that the data know), which is where the
-evidence does not change with s. The evidence of a fit pays for having chosen s.
-
-Reference: MacKay (1992), Bayesian interpolation, eq. 32; Gelman and Hill (2007), ch. 12.
+A fit holds the spread, and the spread follows from where the groups came to rest (`simpel_cli.priors.spreads`), their posterior
+variance from the Laplace approximation. The evidence of a fit pays for having chosen it.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.priors.spreads import LEAST, factor_of, sd_of_log
 
 BEGIN = 0.35  # of the largest spread, where a fit begins
-LEAST = 0.01  # of it: groups are alike
 ROUNDS = 4  # of fits with another spread
 NEARLY = 0.1  # of a spread: it moves no more
 
@@ -42,14 +36,12 @@ class Known(NamedTuple):
     @property
     def factor(self) -> float:
         """By what the spread is to be multiplied."""
-        if self.gamma > 1:
-            return float(np.sqrt(self.squares / self.gamma))
-        return float(np.sqrt((self.squares + self.size - self.gamma) / self.size))
+        return float(factor_of(jnp.asarray(self.squares), jnp.asarray(self.gamma), self.size))
 
     @property
     def sd(self) -> float:
         """Standard deviation of the logarithm of the spread."""
-        return float(1 / np.sqrt(2 * max(self.gamma, 0.5)))
+        return float(sd_of_log(jnp.asarray(self.gamma)))
 
 
 class Spreading:

@@ -19,6 +19,7 @@ from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
+from simulators.groups import slots_of
 
 BASES = (2, 4)  # waves per argument: a function that needs few is seen sooner with few
 MOST_FITTED = 2
@@ -60,7 +61,8 @@ def interaction(
     """
     search, assessor, chosen = levels.search, levels.assessor, levels.chosen
     model = search.plan.augmented.model
-    if len(model.states) + len(model.inputs) > MOST_ARGUMENTS:
+    slots = sum(len(column) for column in slots_of(model))  # which group a row is of is no argument
+    if len(model.states) + len(model.inputs) - slots > MOST_ARGUMENTS:
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
     terms = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]

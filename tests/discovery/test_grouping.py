@@ -1,0 +1,100 @@
+"""Whether grouping pays, asked by a search itself of the columns that `data.groups` names, on planted groups."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from command_line import simpel
+from test_effects_by_group import CART, DATA
+
+from simpel_cli.data import Measurements
+from simpel_cli.discovery.search.grouping import Grouping, grouped_effects, sentence_of
+from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.errors import ConfigError
+from simpel_cli.studies.declared import Declared
+from simulators.effects import Expression
+from simulators.model import Declared as Simulator
+
+
+def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]") -> dict[str, Any]:
+    """Balls whose drag the simulator lacks; the verdict of a search that nobody told of the groups but the data."""
+    for group in ("sim", "data"):
+        (folder / "my" / group).mkdir(parents=True)
+    plant = CART.format(name="plant", more=", c: {unit: 1/m, range: [0.05, 2]}", rate="b*u - c*v*abs(v)")
+    (folder / "my/sim/plant.yaml").write_text(plant)
+    (folder / "my/sim/cart.yaml").write_text(CART.format(name="cart", more="", rate="b*u"))
+    text = DATA.format(path=folder / "made/measurements.parquet")
+    (folder / "my/data/cart.yaml").write_text(f"{text}groups: {groups}\n")
+    made = simpel(
+        folder, "simulate", "--config-dir", "my", "sim=plant", "simulation.episodes=16", "simulation.steps=60",
+        "simulation.seed=1", "simulation.noise_std={s: 0.005, v: 0.01}", "simulation.truth={b: 1.3, c: 0.4}",
+        "simulation.initial={s: [-0.2, 0.2], v: [-1, 1]}", f"simulation.groups={{ball: {ball}}}", "out=made",
+    )  # fmt: skip
+    assert made.code == 0, made.err
+    found = simpel(
+        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", "effect=[quadratic_drag]", "close=false",
+        "report=false", "discovery.pairs=false", "hydra.run.dir=run", *words,
+    )  # fmt: skip
+    assert found.code == 0, found.err
+    verdict: dict[str, Any] = json.loads((folder / "run" / "verdict.json").read_text())
+    assert [e["name"] for e in verdict["effects"]] == ["quadratic_drag"]
+    return verdict
+
+
+def test_that_balls_have_drags_of_their_own_is_found_without_being_asked(tmp_path: Path) -> None:
+    verdict = discovered(tmp_path, "{count: 6, parameters: {c: {law: lognormal, std: 0.5}}}")
+    (one,) = verdict["grouping"]
+    assert (one["effect"], one["per"], one["pays"], one["gate"]["passed"]) == ("quadratic_drag", "ball", True, True)
+    assert one["gain"] > 50
+    assert f"Grouping quadratic drag by ball pays (+{one['gain']:.0f} nats)." in verdict["summary"]
+    (group,) = verdict["groups"]
+    assert group["log_evidence_gain"] == pytest.approx(one["gain"], rel=0.1)
+    truth = yaml.safe_load((tmp_path / "made/card.yaml").read_text())["truth_by_group"]["ball"]
+    for name, own in group["values"].items():
+        assert own["value"] == pytest.approx(truth[name]["c"], rel=0.1)
+    assert verdict["remainder"] is None  # one drag for all balls leaves something that depends on v
+    assert verdict["error"]["after"]["horizon"]["v"] < 0.012  # 0.162 with one
+    (file,) = (tmp_path / "run/conf/sim").glob("*.yaml")
+    assert yaml.safe_load(file.read_text())["parameters"]["c"]["per"] == "ball"
+
+
+def test_that_balls_are_alike_is_said(tmp_path: Path) -> None:
+    verdict = discovered(tmp_path, "{count: 6}")
+    (one,) = verdict["grouping"]
+    assert (one["pays"], one["gate"], verdict["groups"]) == (False, None, [])
+    assert -20 < one["gain"] < 0
+    assert f"Grouping quadratic drag by ball does not pay ({one['gain']:+.0f} nats)." in verdict["summary"]
+    (file,) = (tmp_path / "run/conf/sim").glob("*.yaml")
+    assert "per" not in yaml.safe_load(file.read_text())["parameters"]["c"]
+
+
+def test_only_a_search_asks() -> None:
+    """Groups that only a search asks about are no inputs of what is fitted."""
+    sim = Simulator("s", dt=1, states={"x": {"unit": "m", "range": [0, 1]}}, dynamics={"x": "-x"}).model()
+    groups = {"sim": sim, "data": Measurements("a.csv", groups=("ball",))}
+    drag = Expression("drag", acts_on="x", term="-c*x", parameters={"c": {"range": [0, 1]}})
+    for effects, columns in (([], {}), ([drag], {"ball": "data.groups"})):
+        source = Declared({}, groups | {"effect": effects}).source
+        assert source.columns_of_groups == columns
+    with pytest.raises(ConfigError, match=r"data\.groups: \('a ball',\) is not allowed, only a list of names"):
+        Measurements("a.csv", groups=("a ball",))
+
+
+def test_words_say_why_it_does_not_pay() -> None:
+    gate = Gate(3.0, -1.0, 7.0, "episode", harm=False, passed=False)
+    found = [
+        Grouping("drag", "ball", 30.2, gate._replace(passed=True), pays=True),
+        Grouping("dry_friction", "day", 12.0, gate, pays=False),
+        Grouping("drag", "day", 9.0, None, pays=False),
+    ]
+    assert sentence_of(found) == (
+        " Grouping drag by ball pays (+30 nats). Grouping dry friction by day does not pay (+12 nats, but not on held-out"
+        " episodes). Grouping drag by day does not pay (+9 nats, but another grouping explains more)."
+    )
+    effects = [
+        Expression(n, acts_on="x", term="-c*x", parameters={"c": {"range": [0, 1]}}) for n in ("drag", "dry_friction")
+    ]
+    assert [e.per for e in grouped_effects(effects, found)] == ["ball", ""]
+    assert sentence_of([]) == ""
