@@ -210,6 +210,7 @@ def _made(
         even: whether rows stray, and move to even ones.
     """
     model, n_states = plan.augmented.model, episode.states.shape[1]
+    found = found._replace(smooth=_on_from_row_to_row(found.smooth, model))
     values = np.concatenate([episode.states, episode.outputs], axis=1)
     there = np.isfinite(values)
     smoothed = np.concatenate([found.smooth, _read(model, found.smooth, episode, p, plan)], axis=1)
@@ -297,6 +298,16 @@ def _moved(episode: Episode, smoothed: np.ndarray) -> np.ndarray:
     rate = np.diff(smoothed, axis=0) / step[:, None]
     rate = np.concatenate([rate[:1], rate])
     return np.where(np.isfinite(rate), rate, 0.0) * episode.late
+
+
+def _on_from_row_to_row(smoothed: np.ndarray, model: Model) -> np.ndarray:
+    """Return smoothed states, (T, nx), whose angles go on from row to row: windows may begin on turns of their own."""
+    on = smoothed.copy()
+    for i, q in enumerate(model.states):
+        there = np.isfinite(on[:, i])
+        if q.periodic:
+            on[there, i] = np.unwrap(on[there, i])
+    return on
 
 
 def _nearest_turn(angle: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from simpel_cli.data.checks.sensors import IRREGULAR_SHARE, irregular_share
 from simpel_cli.data.recording import Episode
+from simpel_cli.filtering.measurements.windows import strays
 
 FEWEST = 3  # rows that a line is laid through
 SUBSTEPS = 4  # of Runge and Kutta between two stamps
@@ -21,11 +22,14 @@ Rates = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of states (T, nx) and 
 
 
 def uneven(episodes: Sequence[Episode], dt: float) -> bool:
-    """Whether stamps of rows that follow each other stray, as the check `jitter` has it; dt: of the simulator, s."""
+    """Whether stamps of rows that follow each other stray, as the check `jitter` has it; dt: of the simulator, s.
+
+    Rows of an even clock whose stamps are rounded are even already: by their stamps they would be moved away from there.
+    """
     if any(e.next_states is not None for e in episodes):
         return False
     steps = np.concatenate([np.diff(e.time) for e in episodes])
-    if not len(steps) or not np.isfinite(steps).all():
+    if not strays(steps, dt):
         return False
     usual = float(np.median(steps))
     return abs(usual / dt - 1) < 0.5 and irregular_share(steps, usual) > IRREGULAR_SHARE
@@ -54,11 +58,12 @@ def moved(
     """
     if len(time) < FEWEST:
         return np.zeros(smoothed.shape)
-    j = np.clip(np.searchsorted(time, to, side="right") - 1, 0, len(time) - 2)
-    begin, end, after = smoothed[j], smoothed[j + 1], to - time[j]
-    whole = time[j + 1] - time[j]
+    j = np.clip(np.searchsorted(time, to, side="right") - 1, 0, len(time) - 1)
+    following = np.minimum(j + 1, len(time) - 1)  # behind the last stamp there is none: the flow goes on, inputs stay
+    begin, end, after = smoothed[j], smoothed[following], to - time[j]
+    whole = np.where(following > j, time[following] - time[j], np.inf)
     straight = np.isin(np.arange(inputs.shape[1]), list(linear))
-    slope = np.where(straight, (inputs[j + 1] - inputs[j]) / whole[:, None], 0.0)
+    slope = np.where(straight, (inputs[following] - inputs[j]) / whole[:, None], 0.0)
 
     def flow(length: np.ndarray) -> np.ndarray:
         x, h = begin, (length / SUBSTEPS)[:, None]
@@ -70,7 +75,7 @@ def moved(
             x = x + h / 6 * (a + 2 * b + 2 * c + rates(x + h * c, u[2]))
         return x
 
-    lacking = (np.clip(after / whole, 0, 1))[:, None] * (end - flow(whole))
+    lacking = (np.clip(after / whole, 0, 1))[:, None] * (end - flow(np.where(following > j, whole, 0.0)))
     shift = flow(after) + lacking - smoothed
     return np.where(np.isfinite(shift), shift, 0.0)
 
@@ -93,7 +98,7 @@ def inputs_at(time: np.ndarray, to: np.ndarray, inputs: np.ndarray, linear: Sequ
             found[:, j] = np.interp(to, time, inputs[:, j])
             continue
         # the integral of a held input is straight between stamps; before the first and behind the last it goes on
-        stamps = np.concatenate([[time[0] - 1.0], time, [time[-1] + 1.0]])
+        stamps = np.concatenate([[min(time[0], ends[0]) - 1.0], time, [max(time[-1], ends[-1]) + 1.0]])
         held = np.append(inputs[0, j], inputs[:, j])
         whole = np.append(0.0, np.cumsum(held * np.diff(stamps)))
         found[:, j] = np.diff(np.interp(ends, stamps, whole)) / np.diff(ends)

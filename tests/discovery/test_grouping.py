@@ -34,8 +34,8 @@ def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]") -> 
     )  # fmt: skip
     assert made.code == 0, made.err
     found = simpel(
-        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", "effect=[quadratic_drag]", "close=false",
-        "report=false", "discovery.pairs=false", "hydra.run.dir=run", *words,
+        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", "effect=[quadratic_drag,input_backlash]",
+        "close=false", "report=false", "discovery.pairs=false", "hydra.run.dir=run", *words,
     )  # fmt: skip
     assert found.code == 0, found.err
     verdict: dict[str, Any] = json.loads((folder / "run" / "verdict.json").read_text())

@@ -7,6 +7,7 @@ from test_filter_clock import DT, A, B, model, motion
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.filtering.estimated_rows import needed, whole, with_estimates
 from simpel_cli.filtering.even_rows import even_times, inputs_at, moved, uneven
+from simulators.model import Declared
 
 NOISE, ROWS = 0.01, 60
 CHECKS = (Check("jitter", False, "38 % of the steps differ; data.resample: 0.2 makes them equal"),)
@@ -101,3 +102,51 @@ def test_inputs_and_shifts_in_closed_form() -> None:
     np.testing.assert_allclose(even_times(5 + 0.1 * np.arange(9.0)), 5 + 0.1 * np.arange(9.0))
     even = Episode("e", np.arange(50) * 0.1, np.zeros((50, 1)), np.zeros((50, 1)), np.zeros((50, 0)))
     assert not uneven([even], 0.1)
+
+
+def test_rounded_stamps_of_an_even_clock_do_not_stray() -> None:
+    """A camera at 30 Hz with stamps in ms: a third of its steps differ by 3 %, yet its rows are even."""
+    time = np.round(np.arange(90) / 30, 3)
+    one = Episode("e", time, np.zeros((90, 1)), np.zeros((90, 1)), np.zeros((90, 0)))
+    assert not uneven([one], 1 / 30)
+    strayed = time + np.random.default_rng(0).uniform(-3e-3, 3e-3, 90)
+    assert uneven([one._replace(time=strayed)], 1 / 30)
+
+
+def test_inputs_of_slow_rows_go_on_at_both_ends() -> None:
+    """Rows a minute apart, whose line begins before the first stamp and ends behind the last."""
+    time = 60 * np.arange(9.0) + np.array([4, -5, 3, 0, 1, -2, 3, -4, -5.0])
+    to = even_times(time)
+    assert to[0] < time[0] - 1
+    np.testing.assert_allclose(inputs_at(time, to, np.full((9, 1), 2.0), ()), 2.0)
+
+
+def test_behind_the_last_stamp_the_last_input_acts() -> None:
+    time, to = np.array([0.0, 1.0, 1.9]), np.array([0.0, 1.0, 2.0])
+    u = np.array([[1.0], [1.0], [5.0]])
+    shift = moved(time, to, np.array([[0.0], [1.0], [1.9]]), u, (), lambda x, u: u)
+    np.testing.assert_allclose(shift[:, 0], [0, 0, 0.5], atol=1e-12)
+
+
+def test_angles_go_round_between_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An encoder that is silent where a window begins: the filter begins there on the turn about 0, whatever the record's."""
+    monkeypatch.setattr("simpel_cli.filtering.setup.windows_.LONGEST_TEST", 50)
+    wheel = Declared(
+        "wheel", dt=0.1,
+        states={
+            "a": {"unit": "rad", "range": [-3.2, 3.2], "periodic": True}, "w": {"unit": "rad/s", "range": [-9, 9]},
+        },
+        inputs={"u": {"unit": "V", "range": [-3, 3]}}, parameters={"b": {"unit": "rad/s^2/V", "range": [0.5, 2]}},
+        dynamics={"a": "w", "w": "b*u"},
+    ).model()  # fmt: skip
+    random, rows, made = np.random.default_rng(2), 200, []
+    for k in range(3):
+        time = 0.1 * (np.arange(rows) + random.uniform(-0.3, 0.3, rows))
+        states = np.stack([4 * time, np.full(rows, 4.0)], axis=1) + 0.01 * random.normal(size=(rows, 2))
+        states[50::50, 0] = np.nan
+        made.append(Episode(f"{k}", time, states, np.zeros((rows, 1)), np.zeros((rows, 0))))
+    given = Recording(tuple(made[:2]), tuple(made[2:]), (), {"a": 0.01, "w": 0.01}, (), CHECKS, ())
+    found = with_estimates(given, wheel, ("a", "w"))
+    for before, after in zip((*given.train, *given.test), (*found.train, *found.test), strict=True):
+        there = np.isfinite(before.states[:, 0])
+        np.testing.assert_allclose(after.states[there, 0], 4 * after.time[there], atol=0.1)

@@ -71,7 +71,7 @@ def groupings(
     if not asked:
         return []
     terminal.line(f"does {' or '.join(e.name for e in alike)} differ by {' or '.join(columns)}", "groups")
-    small, own = _small(search, chosen, list(asked.values()), attach, options)
+    small, own = _small(search, chosen, effects, list(asked.values()), attach, options)
     judge = Assessor(small.plan, assessor.horizon)
     found: dict[str, Grouping] = {}
     left, taken = dict(asked), 0
@@ -115,13 +115,19 @@ def sentence_of(found: Sequence[Grouping]) -> str:
 
 
 def _small(
-    search: Search, chosen: Trial, asked: Sequence[tuple[str, str, Expression]], attach: Attach, options: Discovery
+    search: Search,
+    chosen: Trial,
+    effects: Sequence[Expression],
+    asked: Sequence[tuple[str, str, Expression]],
+    attach: Attach,
+    options: Discovery,
 ) -> tuple[Search, Trial]:
     """Return a search over the chosen terms and the same that differ, and the chosen model in it."""
     own = [search.terms[t] for t in chosen.terms]
     kept = {(e.name, *key_of(t)[1:]) for t in own for name, _, e in asked if t.effect == name}
-    effects = [e for _, _, e in asked]
-    plan = attach(effects=effects, kept=kept, extra=own)._replace(windows=search.plan.windows, spare=search.plan.spare)
+    # with the whole catalogue, which says how much of the past is in front of a window
+    every = [*effects, *(e for _, _, e in asked)]
+    plan = attach(effects=every, kept=kept, extra=own)._replace(windows=search.plan.windows, spare=search.plan.spare)
     z = carried(search.plan, chosen.optimum.z, plan)
     settled = carried(search.plan, search.plan.start, plan)
     groups = max(sum(len(g.names) for g in t.groupings) for t in plan.augmented.terms)

@@ -159,7 +159,11 @@ def clocked(episodes: Sequence[Episode], dt: float) -> bool:
     """Whether rows are not dt apart or values not measured at their rows. Stamps of an even clock may be rounded."""
     if any(e.late is not None and np.any(e.late > 0) for e in episodes):
         return True
-    steps = np.concatenate([np.diff(e.time) for e in episodes])
+    return strays(np.concatenate([np.diff(e.time) for e in episodes]), dt)
+
+
+def strays(steps: np.ndarray, dt: float) -> bool:
+    """Whether the clock itself strays; an even one whose stamps are rounded does not."""
     if not np.isfinite(steps).all() or len(steps) == 0 or np.std(steps) <= UNEVEN * dt:
         return False
     # an even clock whose stamps are rounded knows two steps, one tick apart, about its own
