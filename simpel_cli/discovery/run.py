@@ -26,7 +26,7 @@ from simpel_cli.discovery.search.between_rows import (
     words_of,
 )
 from simpel_cli.discovery.search.calibration import calibrated, prepared, with_heavy_tails
-from simpel_cli.discovery.search.grouping import Grouping, grouped_effects, groupings
+from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
@@ -213,8 +213,10 @@ def _with_groups(study: Study, searched: Searched, terminal: Terminal) -> Search
         study = study._replace(declared=declared._replace(groups=declared.groups | {"effect": effects}))
         again = _search(study, terminal)
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
-            break
-        known = {(g.effect, g.per): g for g in (*searched.groupings, *again.groupings)}
+            said = confirmed(searched.groupings, searched.search, searched.selection.chosen)
+            return searched._replace(groupings=said)
+        before = confirmed(searched.groupings, again.search, again.selection.chosen)
+        known = {(g.effect, g.per): g for g in (*before, *again.groupings)}
         searched = again._replace(groupings=list(known.values()))
     return searched
 

@@ -2,7 +2,8 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -10,8 +11,9 @@ from command_line import simpel
 from test_effects_by_group import CART, DATA
 
 from simpel_cli.data import Measurements
-from simpel_cli.discovery.search.grouping import Grouping, grouped_effects, sentence_of
+from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, sentence_of
 from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.errors import ConfigError
 from simpel_cli.studies.declared import Declared
 from simulators.effects import Expression
@@ -98,3 +100,17 @@ def test_words_say_why_it_does_not_pay() -> None:
     ]
     assert [e.per for e in grouped_effects(effects, found)] == ["ball", ""]
     assert sentence_of([]) == ""
+
+
+def test_what_a_search_with_it_did_not_choose_does_not_pay() -> None:
+    gate = Gate(3.0, 1.0, 7.0, "episode", harm=False, passed=True)
+    found = [Grouping("drag", "ball", 30.2, gate, pays=True), Grouping("leak", "day", 20.0, gate, pays=True)]
+    terms = [SimpleNamespace(effect="drag", groupings=("c",)), SimpleNamespace(effect="leak", groupings=())]
+    search = object.__new__(Search)
+    search.terms = terms  # type: ignore[assignment]
+    chosen = Trial((0, 1), cast(Any, None))
+    said = confirmed(found, search, chosen)
+    assert [g.pays for g in said] == [True, False]
+    assert sentence_of(said[1:]) == (
+        " Grouping leak by day does not pay (+20 nats, but a search with it chose otherwise)."
+    )

@@ -100,12 +100,20 @@ def grouped_effects(effects: Sequence[Expression], found: Sequence[Grouping]) ->
     return [replace(e, per=per[e.name]) if e.name in per else e for e in effects]
 
 
+def confirmed(found: Sequence[Grouping], search: Search, chosen: Trial) -> list[Grouping]:
+    """Return what was found; a grouping that a search with it did not choose does not pay."""
+    differ = {search.terms[t].effect for t in chosen.terms if search.terms[t].groupings}
+    return [g._replace(pays=g.pays and g.effect in differ) for g in found]
+
+
 def in_words(one: Grouping) -> str:
     """Return what a search says of one grouping."""
     does = "pays" if one.pays else "does not pay"
     refused = ""
     if one.gain > ACCEPT and not one.pays:
         refused = ", but another grouping explains more" if one.gate is None else ", but not on held-out episodes"
+        if one.gate is not None and one.gate.passed:
+            refused = ", but a search with it chose otherwise"
     return f"grouping {one.effect.replace('_', ' ')} by {one.per} {does} ({one.gain:+.0f} nats{refused})"
 
 
