@@ -95,15 +95,19 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
     z = _calibrated(plan)
     parameters, level = plan.coordinates.physical(jnp.asarray(z))
     p, noise = np.asarray(parameters), np.asarray(level.r)
-    even = uneven((*recording.train, *recording.test), model.dt)
+    every = (*recording.train, *recording.test)
+    even = even_times([e.time for e in every]) if uneven(every, model.dt) else [None] * len(every)
     train = _of_episodes(plan, tracks, z, recording.train, recording.outputs)
     test = _of_episodes(plan, tracks, z, recording.test, recording.outputs) if recording.test else []
     typical = _typical(plan, noise, train)
     together = _measured_together(recording.test)
-    made = [_made(plan, e, f, p, typical, kept=None, even=even) for e, f in zip(recording.train, train, strict=True)]
+    made = [
+        _made(plan, e, f, p, typical, kept=None, even=at)
+        for e, f, at in zip(recording.train, train, even[: len(train)], strict=True)
+    ]
     tested = [
-        _once_known(_made(plan, e, f, p, typical, kept=together, even=even), e, together)
-        for e, f in zip(recording.test, test, strict=True)
+        _once_known(_made(plan, e, f, p, typical, kept=together, even=at), e, together)
+        for e, f, at in zip(recording.test, test, even[len(train) :], strict=True)
     ]
     good, left = [[e for e in part if np.isfinite(e.states).all()] for part in (made, tested)]
     if not good:
@@ -111,7 +115,7 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
             f"sim: the filter of {model.name} lost the measurements in all of {len(made)} episodes, so that nothing tells the "
             "values that are missing. Give rows in which everything was measured, or narrow sim.parameters."
         )
-    before = tuple(_moved_to_even(c) if even else c for c in recording.checks)
+    before = tuple(_moved_to_even(c) if even[0] is not None else c for c in recording.checks)
     checks = before if whole(recording) else (*before, _check(plan, recording, good, noise, typical, together))
     level_of = {q.name: float(np.sqrt(v)) for q, v in zip(plan.augmented.model.states, typical, strict=True)}
     level_of |= dict(zip(plan.augmented.measured, noise.tolist(), strict=True))
@@ -196,7 +200,7 @@ def _made(
     typical: np.ndarray,
     kept: np.ndarray | None,
     *,
-    even: bool,
+    even: np.ndarray | None,
 ) -> Episode:
     """Return the episode with every value at its row.
 
@@ -207,7 +211,7 @@ def _made(
         p: parameters of the model, physical.
         typical: variance of a measured value, per state.
         kept: of an episode to test on, which columns tell estimates from measurements; None: of one to learn from.
-        even: whether rows stray, and move to even ones.
+        even: times of the even rows that those which stray move to, (T,) s; None: they stay.
     """
     model, n_states = plan.augmented.model, episode.states.shape[1]
     found = found._replace(smooth=_on_from_row_to_row(found.smooth, model))
@@ -227,8 +231,8 @@ def _made(
         at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
         values = values + np.where(at_an_end, 0.0, _moved(episode, smoothed))
     time, inputs = episode.time, episode.inputs
-    if even:
-        time = even_times(episode.time)
+    if even is not None:
+        time = even
         inputs = inputs_at(episode.time, time, episode.inputs, model.linear)
         rates = partial(_rates, model, p)
         there_then = found.smooth + moved(episode.time, time, found.smooth, episode.inputs, model.linear, rates)

@@ -15,7 +15,8 @@ from simpel_cli.data.checks.sensors import IRREGULAR_SHARE, irregular_share
 from simpel_cli.data.recording import Episode
 from simpel_cli.filtering.measurements.windows import strays
 
-FEWEST = 3  # rows that a line is laid through
+FEWEST = 2  # rows that a line is laid through
+LONG = 30  # rows that tell the step of their own clock; from fewer, stamps that stray tell it worse than all episodes together
 SUBSTEPS = 4  # of Runge and Kutta between two stamps
 
 Rates = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of states (T, nx) and inputs (T, nu), in order, (T, nx)
@@ -35,12 +36,14 @@ def uneven(episodes: Sequence[Episode], dt: float) -> bool:
     return abs(usual / dt - 1) < 0.5 and irregular_share(steps, usual) > IRREGULAR_SHARE
 
 
-def even_times(time: np.ndarray) -> np.ndarray:
-    """Return the line through stamps (T,), s; a clock that is a little fast or slow stays so."""
-    if len(time) < FEWEST:
-        return time
-    row = np.arange(len(time)) - (len(time) - 1) / 2
-    return np.asarray(time.mean() + row * (row @ time) / (row @ row))
+def even_times(times: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the lines through the stamps of episodes, each (T,) s; a clock that is a little fast or slow stays so."""
+    rows = [np.arange(len(t)) - (len(t) - 1) / 2 for t in times]
+    common = sum(float(r @ t) for r, t in zip(rows, times, strict=True)) / sum(float(r @ r) for r in rows)
+    return [
+        t.mean() + r * (float(r @ t) / float(r @ r) if len(t) >= LONG else common)
+        for r, t in zip(rows, times, strict=True)
+    ]
 
 
 def moved(

@@ -83,6 +83,7 @@ class Populations:
         variance = jnp.sum(jax.scipy.linalg.solve_triangular(factor, jnp.eye(n), lower=True) ** 2, axis=0)
         gamma = jnp.stack([jnp.sum(1 - jnp.minimum(variance[rows], 1.0)) for rows in self.members])
         paid = jnp.sum(jnp.log(jnp.diag(factor)))
+        gamma = jnp.where(jnp.isfinite(gamma), gamma, 0.0)  # no information that could be inverted: they know none
         return Told(gamma.astype(dtype), jnp.where(jnp.isfinite(paid), paid, jnp.inf).astype(dtype))
 
     def moved(self, u: Float[Array, " dp"], told: Told, far: float) -> Moved:
