@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from command_line import TINY, simpel
@@ -48,6 +49,8 @@ def test_a_drag_of_every_ball_is_found_and_fitted(tmp_path: Path) -> None:
     for name, own in group["values"].items():
         assert own["value"] == pytest.approx(truth[name]["c"], rel=0.1)
     assert group["log_evidence_gain"] > 50
+    arguments = pq.read_table(tmp_path / "run/residuals.parquet").column_names[-3:]
+    assert arguments == ["s", "v", "u"]  # which ball a row is of is drawn as no argument of a force
     (file,) = (tmp_path / "run/conf/sim").glob("*.yaml")
     written = yaml.safe_load(file.read_text())["parameters"]["c"]
     assert written["per"] == "ball"

@@ -34,6 +34,7 @@ from simulators.effects.expression import per
 from simulators.effects.term import OPERATORS, SENSOR
 from simulators.expression import symbols_used
 from simulators.groups import slots_of
+from simulators.model import Model
 
 BEFORE, WITHOUT, AFTER = "before", "without", "after"
 GRID = 101  # points of an effect's curve
@@ -106,6 +107,9 @@ def evidence_tables(
     residual = joined(residuals)
     names = dict(zip([*arguments[0], *arguments[1]], [*model.states, *model.inputs], strict=True))
     span = {q.name: residual[column] for column, q in names.items()}
+    slots = _slots(model)
+    names = {column: q for column, q in names.items() if q.name not in slots}
+    residual = {column: values for column, values in residual.items() if column not in slots}
     return {
         "residuals": EvidenceTable(residual, {"time": "s"} | {column: q.unit for column, q in names.items()}),
         "effect_curves": EvidenceTable(_curves(search, selection, span), {}),
@@ -164,12 +168,17 @@ def _curves(search: Search, selection: Selection, span: dict[str, np.ndarray]) -
     return as_columns(rows)
 
 
+def _slots(model: Model) -> set[str]:
+    """Return the names of the inputs that say which group a row is of: no force is a function of them."""
+    return {model.inputs[j].name for of in slots_of(model) for j in of}
+
+
 def _coverage(search: Search, recording: Recording) -> Columns:
     """Return the span of every measured state and input in the training data, beside its declared range."""
     model = search.plan.augmented.model
     states = np.concatenate([e.states for e in recording.train])
     inputs = np.concatenate([e.inputs for e in recording.train])
-    slots = {model.inputs[j].name for of in slots_of(model) for j in of}  # which group a row is of has no range
+    slots = _slots(model)  # which group a row is of has no range
     rows = []
     for values, group in ((states, model.states), (inputs, model.inputs)):
         for j, q in enumerate(group):
