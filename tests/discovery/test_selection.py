@@ -300,7 +300,7 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
         monkeypatch.setattr(calibration, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
     plan = real.plan._replace(spare=test)
-    found = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal, {})
+    found = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
     np.testing.assert_array_equal(found.test.ok, none_left)
     np.testing.assert_array_equal(found.search.plan.spare.ok, none_left)  # what is held out to judge effects
 

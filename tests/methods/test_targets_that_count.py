@@ -120,7 +120,7 @@ def test_white_model_error_does_not_shrink_with_the_weight_of_a_gps_row() -> Non
     rule = ExactGP(SysID(noise=FIXED), particles=200).bind(setting, problem)
     state = run(rule, 1)
     found = rule.predict(state, jnp.asarray(GRID))
-    a, b = np.asarray(state.phi)
+    a, b = np.asarray(state.found.phi)
     seen = apart(X, X) + np.diag(MODEL_ERROR + NOISE**2 / COUNTS)
     gain = np.linalg.solve(seen, apart(X, GRID)).T
     np.testing.assert_allclose(found.mean, a * GRID + b + gain @ (y - a * X - b), atol=2e-5)
