@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
+import yaml
 
 ROOT = Path(__file__).parents[1]
 KEPT = (
@@ -42,6 +44,14 @@ parameters:
 dynamics:
   s: v
   v: (c*u - k*s)/m
+"""
+LINE = """\
+_target_: simulators.model.Declared
+name: line
+dt: 1.0
+inputs: {x: {unit: "", range: [0, 4]}}
+parameters: {a: {range: [0.5, 3.5]}}
+outputs: {y: a*x}
 """
 RIG = """\
 path: ../run.csv
@@ -139,6 +149,18 @@ def rig(folder: Path, *, cart: str = CART, data: str = RIG, measurements: str | 
     if content != b"absent":
         (my / "run.csv").write_bytes(content)
     return my
+
+
+def line(folder: Path, x: np.ndarray, y: np.ndarray, train: int, declared: dict[str, dict[str, object]]) -> None:
+    """Write the folder `my` of a user with the simulator `line`, of whose rows the first train it, and data YAMLs by name."""
+    for part in ("sim", "data"):
+        (folder / "my" / part).mkdir(parents=True)
+    (folder / "my" / "sim" / "line.yaml").write_text(LINE)
+    split = np.where(np.arange(len(x)) < train, "train", "test")
+    pd.DataFrame({"x": x, "y": y, "split": split}).to_csv(folder / "my" / "line.csv", index=False)
+    for name, said in declared.items():
+        data = {"path": "../line.csv", "split": {"column": "split"}} | said
+        (folder / "my" / "data" / f"{name}.yaml").write_text(yaml.safe_dump(data))
 
 
 def rows(path: Path, *leave_out: str, split: str | None = None) -> list[dict[str, object]]:

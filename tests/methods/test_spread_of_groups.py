@@ -164,6 +164,14 @@ def test_a_spread_is_drawn_as_far_as_it_is_known() -> None:
     np.testing.assert_array_equal(draws[:, -1], white[:, -1])
 
 
+def test_information_that_cannot_be_inverted_tells_no_group() -> None:
+    populations = Populations(prior_of().params)
+    count = len(prior_of().params)
+    told = populations.told(jnp.full((count, count), jnp.nan), jnp.zeros(count, bool))
+    np.testing.assert_array_equal(told.gamma, 0.0)
+    assert told.paid == np.inf
+
+
 METHODS = {
     "sysid": (SysID(particles=200, noise=FIXED), 0.0, 100),
     "gp": (ExactGP(SysID(noise=FIXED), particles=200), 1e-3, 1),

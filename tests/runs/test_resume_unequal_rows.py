@@ -4,22 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-import yaml
-from command_line import rows, simpel
+from command_line import line, rows, simpel
 
 from simpel_cli.errors import Interrupted
 from simpel_cli.inference import loop
 
-LINE = """\
-_target_: simulators.model.Declared
-name: line
-dt: 1.0
-inputs: {x: {unit: "", range: [0, 4]}}
-parameters: {a: {range: [0.5, 3.5]}}
-outputs: {y: a*x}
-"""
 HIGH = 5.0
 SCALE = {"noise": {"scale": {"y": "0.1 + 0.2*x"}}}
 DECLARED = {"scale": SCALE, "sensor": SCALE | {"sensor": {"y": {"saturates": [None, HIGH]}}}}
@@ -30,17 +20,10 @@ FEW = ("method.steps=1000", "method.particles=3", "method.network.hidden=[8]", "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unequal")
-    for part in ("sim", "data"):
-        (folder / "my" / part).mkdir(parents=True)
-    (folder / "my" / "sim" / "line.yaml").write_text(LINE)
     rng = np.random.default_rng(0)
     x = rng.uniform(0, 4, 60)
     y = np.minimum(2 * x + (0.1 + 0.2 * x) * rng.normal(size=60), HIGH)
-    split = np.where(np.arange(60) < 40, "train", "test")
-    pd.DataFrame({"x": x, "y": y, "split": split}).to_csv(folder / "my" / "line.csv", index=False)
-    for name, said in DECLARED.items():
-        data = {"path": "../line.csv", "split": {"column": "split"}} | said
-        (folder / "my" / "data" / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    line(folder, x, y, 40, DECLARED)
     return folder
 
 

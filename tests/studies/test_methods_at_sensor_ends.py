@@ -5,17 +5,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
-from command_line import simpel
+from command_line import line, simpel
 
-LINE = """\
-_target_: simulators.model.Declared
-name: line
-dt: 1.0
-inputs: {x: {unit: "", range: [0, 4]}}
-parameters: {a: {range: [0.5, 3.5]}}
-outputs: {y: a*x}
-"""
 A, NOISE, HIGH, ROWS, TRAIN = 2.0, 0.2, 5.0, 120, 80
 NETWORKS = ("method.steps=400", "method.particles=4", "method.network.hidden=[32,32]")
 POOL = ("method.pool=64",)
@@ -33,18 +24,12 @@ OF_SIMULATOR = ("simpel", "simpel_only_sim", "map", "repulsive", "pathwise")  # 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("line")
-    for part in ("sim", "data"):
-        (folder / "my" / part).mkdir(parents=True)
-    (folder / "my" / "sim" / "line.yaml").write_text(LINE)
     rng = np.random.default_rng(0)
     x = rng.uniform(0, 4, ROWS)
     y = np.minimum(A * x + NOISE * rng.normal(size=ROWS), HIGH)
-    split = np.where(np.arange(ROWS) < TRAIN, "train", "test")
-    pd.DataFrame({"x": x, "y": y, "split": split}).to_csv(folder / "my" / "line.csv", index=False)
-    data = {"path": "../line.csv", "split": {"column": "split"}, "noise": {"law": "gaussian"}}
+    data = {"noise": {"law": "gaussian"}}
     sensor = {"sensor": {"y": {"saturates": [None, HIGH]}}}
-    for name, content in (("marked", data | sensor), ("clipped", data)):
-        (folder / "my" / "data" / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    line(folder, x, y, TRAIN, {"marked": data | sensor, "clipped": data})
     return folder
 
 
