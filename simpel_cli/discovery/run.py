@@ -25,7 +25,7 @@ from simpel_cli.discovery.search.between_rows import (
     sentence_of,
     words_of,
 )
-from simpel_cli.discovery.search.calibration import calibrated, prepared, with_heavy_tails
+from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
@@ -35,6 +35,7 @@ from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.smaller import fitter_of, small_search
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
@@ -47,10 +48,9 @@ from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.errors import ConfigError, DataError, Inconclusive
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor
-from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import MOST_GROUPED, members, setup, terms_of
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
@@ -169,9 +169,7 @@ def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str,
         recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
         recording = _counted(same_readings(recording, columns, at, longest, model.dt), study)
         plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
-        width = len(plan.augmented.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + 1
-        fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
-        return float(Search(plan, fitter).base().optimum.log_evidence)
+        return float(small_search(plan, options.lanes, 1).base().optimum.log_evidence)
 
     found = estimated(evidence, ranges, model.dt)
     terminal.line(in_words_of_latency(found), "latency")
@@ -244,21 +242,21 @@ def _search(study: Study, terminal: Terminal) -> Searched:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
     terms = terms_of(model, recording, effects, pairs=options.pairs)
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
-    width = len(model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + options.room + members(plan)
-    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
-    assessor = Assessor(plan, options.horizon)
-    found = calibrated(plan, fitter, assessor, clean, terminal)
-    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+
+    def searched_in(plan: Setup) -> tuple[Assessor, Calibrated, Selection, list[Gate]]:
+        fitter = fitter_of(plan, options.lanes, options.room + members(plan))
+        assessor = Assessor(plan, options.horizon)
+        found = calibrated(plan, fitter, assessor, clean, terminal)
+        return assessor, found, *accepted(found.search, assessor, found.base, options, terminal)
+
+    assessor, found, selection, gates = searched_in(plan)
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms:
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
     if words_of(between_rows) != said:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
-        fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=options.lanes, width=width)
-        assessor = Assessor(plan, options.horizon)
-        found = calibrated(plan, fitter, assessor, clean, terminal)
-        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+        assessor, found, selection, gates = searched_in(plan)
     # beside what is left unexplained, no data tell whether tails are heavy
     heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
     if heavy is not None:

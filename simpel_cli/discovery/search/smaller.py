@@ -7,10 +7,15 @@ from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of
 
 
-def small_search(plan: Setup, side_by_side: int, room: int) -> Search:
-    """Return a search with room for so many unknowns beside those of the simulator and the noise."""
+def fitter_of(plan: Setup, side_by_side: int, room: int) -> Fitter:
+    """Return a fitter with room for so many unknowns beside those of the simulator and the noise."""
     width = len(plan.augmented.model.params) + plan.coordinates.sizes[1] + plan.coordinates.sizes[2] + room
-    return Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=side_by_side, width=width))
+    return Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=side_by_side, width=width)
+
+
+def small_search(plan: Setup, side_by_side: int, room: int) -> Search:
+    """Return a search in a program of its own, with room as of `fitter_of`."""
+    return Search(plan, fitter_of(plan, side_by_side, room))
 
 
 def fitted_again(small: Search, search: Search, chosen: Trial) -> Trial:
