@@ -27,12 +27,14 @@ from simpel_cli.discovery.search.between_rows import (
 )
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
+from simpel_cli.discovery.search.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
+from simpel_cli.discovery.search.own_parameters import in_common, own_parameters, per_of, with_own, written
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import fitter_of, small_search
@@ -79,7 +81,7 @@ class Searched(NamedTuple):
         recording: the measurements that were searched in, with what was found in them.
         between_rows: input -> what it does between rows, where neither simulator nor data say.
         degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
-        groupings: what it is worth that a chosen effect differs from group to group.
+        groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
     """
 
     search: Search
@@ -134,7 +136,9 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         study = open_study(declared, data_folder, whole=False)
     searched = _with_groups(study, _search(study, terminal), terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
-    before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
+    base, per = selection.base, per_of(searched.groupings)
+    base = in_common(search, base, per) if per else base
+    before, after = (assessor(t.optimum.z, searched.windows) for t in (base, selection.chosen))
     found = _verdict(searched, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
     found["summary"] += sentence_of_latency(latencies)
@@ -142,7 +146,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
     declared = _with_linear_inputs(declared, searched.between_rows)
-    if found["effects"]:
+    if found["effects"] or per:
         found |= _correct(declared, searched, found, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
     shown = evidence_tables(search, selection, assessor, searched.recording, searched.windows, before, after)
@@ -209,18 +213,24 @@ def _with_groups(study: Study, searched: Searched, terminal: Terminal) -> Search
             break
         terminal.line("searching once more with it", "groups")
         study = study._replace(declared=declared._replace(groups=declared.groups | {"effect": effects}))
-        again = _search(study, terminal)
+        again = _search(study, terminal, [g for g in searched.groupings if g.parameter])
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
             said = confirmed(searched.groupings, searched.search, searched.selection.chosen)
             return searched._replace(groupings=said)
         before = confirmed(searched.groupings, again.search, again.selection.chosen)
-        known = {(g.effect, g.per): g for g in (*before, *again.groupings)}
+        known = {(g.subject, g.per): g for g in (*before, *again.groupings)}
         searched = again._replace(groupings=list(known.values()))
     return searched
 
 
-def _search(study: Study, terminal: Terminal) -> Searched:
-    """Clean the measurements, calibrate the simulator, choose effects, and accept those that help on held-out episodes."""
+def _search(study: Study, terminal: Terminal, own: list[Grouping] | None = None) -> Searched:
+    """Clean the measurements, calibrate the simulator, choose effects, and accept those that help on held-out episodes.
+
+    Args:
+        study: what is declared.
+        terminal: takes lines.
+        own: which of the simulator's parameters differ from group to group; None: that is asked.
+    """
     model, groups = study.system.source, study.declared.groups
     assert isinstance(model, Model)
     options: Discovery = groups.get("discovery") or Discovery()
@@ -240,6 +250,11 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     rows = sum(len(e.time) for e in recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
+    declared, settled = model, own is not None
+    own = own if own is not None else own_parameters(attach, declared, options)
+    for one in [] if settled else own:
+        terminal.line(grouping_in_words(one), "groups")
+    model = with_own(declared, per_of(own)) if per_of(own) else declared
     terms = terms_of(model, recording, effects, pairs=options.pairs)
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
 
@@ -257,6 +272,16 @@ def _search(study: Study, terminal: Terminal) -> Searched:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
         assessor, found, selection, gates = searched_in(plan)
+    beside = (
+        own
+        if settled or not selection.chosen.terms
+        else own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
+    )
+    if per_of(beside) != per_of(own):
+        for one in beside:
+            terminal.line(f"beside these effects {grouping_in_words(one)}", "groups")
+        terminal.line("searching once more", "groups")
+        return _search(study, terminal, beside)
     # beside what is left unexplained, no data tell whether tails are heavy
     heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
     if heavy is not None:
@@ -271,7 +296,8 @@ def _search(study: Study, terminal: Terminal) -> Searched:
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
-    asked = groupings(search, assessor, selection.chosen, effects, attach_said, options, terminal)
+    left = bool(selection.remainder or disturbance)
+    asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(
         search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
@@ -291,6 +317,9 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, began: f
     found["degrees_of_freedom"] = nu
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
+    if per := per_of(asked):
+        found["steps"][0]["added"] = [f"{name} by {by}" for name, by in per.items()]
+        found["steps"].insert(0, {"added": [], "error": found["error"]["before"]})
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
@@ -326,7 +355,8 @@ def _correct(
     """Write the corrected simulator, and compare both as priors; returns what the verdict says of it."""
     config, model = declared.config, declared.source
     assert isinstance(model, Model)
-    name, node, left_out = corrected(config["sim"], model, searched.search, searched.selection.chosen)
+    per = per_of(searched.groupings)
+    name, node, left_out = corrected(written(config["sim"], per), model, searched.search, searched.selection.chosen)
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
     for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
@@ -340,7 +370,7 @@ def _correct(
         "corrected_sim_lacks": left_out,
         "stack_actions": past_inputs(after.source),
     }
-    if config.get("close", True) and len(left_out) < len(found["effects"]):
+    if config.get("close", True) and (per or len(left_out) < len(found["effects"])):
         try:
             added["as_prior"] = close(declared, after, directory, data_folder, terminal)
         except DataError as error:  # a fit needs whole rows; what was found stands without it

@@ -81,7 +81,7 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
 
 def _table(found: dict[str, Any], directory: Path) -> str:
     """Errors before and after, for terminals."""
-    both = bool(found["effects"])
+    both = bool(found["corrected_sim"])
     cells = [["", "", "before", *(["after", "reduction (95 %)"] if both else []), "noise floor"]]
     for row in rows_of(read_columns(directory / "errors.parquet")):
         label = HORIZONS[row["horizon"]].format(steps=found["error"]["horizon_steps"])
@@ -110,7 +110,7 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         else f"sim={chosen.get('sim', '')} data={chosen.get('data', '')}"
     )
     lines = []
-    if found["corrected_sim"] and found["effects"]:
+    if found["corrected_sim"]:
         name = Path(found["corrected_sim"]).stem
         past = f" data.stack_actions={found['stack_actions']}" if found.get("stack_actions") else ""
         lines.append(

@@ -12,13 +12,16 @@ MIB = 1024  # KiB, in which Linux counts what a process had in memory at most
 FILE = "cost.json"
 
 
-def searched(words: Sequence[str], directory: Path, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+def searched(
+    words: Sequence[str], directory: Path, environment: Mapping[str, str] | None = None, checkout: Path | None = None
+) -> dict[str, Any]:
     """Run `simpel discover`, unless that was done, and return its verdict with what the process cost under `cost`.
 
     Args:
         words: of the command line.
         directory: of the run.
         environment: variables that are set.
+        checkout: of the version that runs; None: where the caller is.
 
     Raises:
         SystemExit: it failed.
@@ -27,7 +30,9 @@ def searched(words: Sequence[str], directory: Path, environment: Mapping[str, st
         raise SystemExit(f"{directory} holds a verdict without its cost ({FILE}); remove it, or choose another --out")
     if not (directory / FILE).exists():
         command = [sys.executable, "-m", "simpel_cli.main", "discover", *words, f"hydra.run.dir='{directory}'"]
-        process = subprocess.Popen(command, env=os.environ | dict(environment or {}), stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command, env=os.environ | dict(environment or {}), stdout=subprocess.DEVNULL, cwd=checkout
+        )
         _, status, used = os.wait4(process.pid, 0)
         if status:
             raise SystemExit(f"simpel discover {' '.join(words)} failed; what it said is in {directory}/run.log")

@@ -1,23 +1,57 @@
 """`simpel discover` on the recordings: `python -m tests.benchmarks.real --out DIR [--only emps ...]` (needs SIMPEL_SHARED).
 
-Every verdict as a row of a table, and the errors after each accepted effect.
+Every verdict as a row of a table, and the errors after each accepted effect. `--before FOLDER` is the checkout of another
+version, which searches the same recordings in the words that it knows.
 """
 
 import argparse
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.cost import searched
 
-EXPERIMENTS = ("free_pendulum", "cascaded_tanks", "ball_drops", "emps", "rc_car_bicycle", "rc_car")
+HERE = Path(__file__).resolve().parents[2]
+EXPERIMENTS = (
+    "free_pendulum",
+    "cascaded_tanks",
+    "ball_drops",
+    "emps",
+    "silverbox",
+    "tclab",
+    "rc_car_bicycle",
+    "rc_car",
+)
 CLOSED = ("free_pendulum", "emps", "rc_car_bicycle")  # SimPEL with the old and the corrected simulator, too
 WORDS = {"rc_car_bicycle": ("effect=[vehicle]",)}
+DESCRIBED = {
+    "ball_drops": ("effect.quadratic_drag.per=ball",)
+}  # what its recording is, in words that older versions lack
+TARGETS = {"sim": "simulators.model.Declared", "data": "simpel_cli.data.Measurements"}  # older versions ask for them
+NEW_KEYS = re.compile(r",? *between_rows: \w+")
 
 
-def run(name: str, out: Path) -> dict[str, Any]:
+def run(name: str, out: Path, *, close: bool = True) -> dict[str, Any]:
     """Search one recording, unless that was done, and return its verdict."""
-    words = [f"experiment={name}", f"close={str(name in CLOSED).lower()}", *WORDS.get(name, ())]
+    closed = close and name in CLOSED
+    words = [f"experiment={name}", f"close={str(closed).lower()}", *WORDS.get(name, ()), *DESCRIBED.get(name, ())]
     return searched(words, out / name)
+
+
+def run_before(name: str, version: Path, out: Path) -> dict[str, Any]:
+    """Search one recording in another version; experiments that it lacks are written for it from those of this one."""
+    written: Sequence[str] = ()
+    if not (version / "conf" / "experiment" / f"{name}.yaml").exists():
+        folder = out / "conf"
+        for group in ("sim", "data", "experiment"):
+            text = NEW_KEYS.sub("", (HERE / "conf" / group / f"{name}.yaml").read_text())
+            file = folder / group / f"{name}.yaml"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(f"_target_: {TARGETS[group]}\n{text}" if group in TARGETS else text)
+        written = ("--config-dir", str(folder))
+    words = [*written, f"experiment={name}", "close=false", *WORDS.get(name, ())]
+    return searched(words, out / f"{name}_before", {"PYTHONPATH": str(version)}, version)
 
 
 def row(name: str, found: dict[str, Any]) -> str:
@@ -55,6 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="tests.benchmarks.real", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=list(EXPERIMENTS), choices=EXPERIMENTS)
+    parser.add_argument("--before", type=Path, help="checkout of another version; nothing is closed then")
     options = parser.parse_args()
     out = options.out.resolve()
     lines = [
@@ -63,12 +98,14 @@ def main() -> None:
     ]
     sentences = []
     for name in options.only:
-        found = run(name, out)
-        lines.append(row(name, found))
-        sentences += [f"* {name}: {found['summary']}", *steps(name, found)]
-    text = "\n".join([*lines, "", *sentences])
-    (out / "table.md").write_text(text + "\n")
-    print(text)
+        verdicts = {name: run(name, out, close=options.before is None)}
+        if options.before:
+            verdicts[f"{name} (before)"] = run_before(name, options.before.resolve(), out)
+        for label, found in verdicts.items():
+            lines.append(row(label, found))
+            sentences += [f"* {label}: {found['summary']}", *steps(label, found)]
+        (out / "table.md").write_text("\n".join([*lines, "", *sentences]) + "\n")
+    print((out / "table.md").read_text())
 
 
 if __name__ == "__main__":

@@ -45,11 +45,18 @@ def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]") -> 
     return verdict
 
 
+def asked(verdict: dict[str, Any], effect: str = "", parameter: str = "") -> dict[str, Any]:
+    """Return what was said of one effect or parameter."""
+    (one,) = (g for g in verdict["grouping"] if (g["effect"], g["parameter"]) == (effect, parameter))
+    return cast(dict[str, Any], one)
+
+
 def test_that_balls_have_drags_of_their_own_is_found_without_being_asked(tmp_path: Path) -> None:
     verdict = discovered(tmp_path, "{count: 6, parameters: {c: {law: lognormal, std: 0.5}}}")
-    (one,) = verdict["grouping"]
-    assert (one["effect"], one["per"], one["pays"], one["gate"]["passed"]) == ("quadratic_drag", "ball", True, True)
+    one = asked(verdict, "quadratic_drag")
+    assert (one["per"], one["pays"], one["gate"]["passed"], one["accepted"]) == ("ball", True, True, True)
     assert one["gain"] > 50
+    assert not asked(verdict, parameter="b")["pays"]  # beside a drag per ball
     assert f"Grouping quadratic drag by ball pays (+{one['gain']:.0f} nats)." in verdict["summary"]
     (group,) = verdict["groups"]
     assert group["log_evidence_gain"] == pytest.approx(one["gain"], rel=0.1)
@@ -64,7 +71,8 @@ def test_that_balls_have_drags_of_their_own_is_found_without_being_asked(tmp_pat
 
 def test_that_balls_are_alike_is_said(tmp_path: Path) -> None:
     verdict = discovered(tmp_path, "{count: 6}")
-    (one,) = verdict["grouping"]
+    assert not asked(verdict, parameter="b")["pays"]
+    one = asked(verdict, "quadratic_drag")
     assert (one["pays"], one["gate"], verdict["groups"]) == (False, None, [])
     assert -20 < one["gain"] < 0
     assert f"Grouping quadratic drag by ball does not pay ({one['gain']:+.0f} nats)." in verdict["summary"]
@@ -95,6 +103,9 @@ def test_words_say_why_it_does_not_pay() -> None:
         " Grouping drag by ball pays (+30 nats). Grouping dry friction by day does not pay (+12 nats, but not on held-out"
         " episodes). Grouping drag by day does not pay (+9 nats, but another grouping explains more)."
     )
+    assert sentence_of([found[0]._replace(accepted=False), found[1]._replace(accepted=False)]) == (
+        " Grouping drag by ball pays (+30 nats)."
+    )
     effects = [
         Expression(n, acts_on="x", term="-c*x", parameters={"c": {"range": [0, 1]}}) for n in ("drag", "dry_friction")
     ]
@@ -105,12 +116,28 @@ def test_words_say_why_it_does_not_pay() -> None:
 def test_what_a_search_with_it_did_not_choose_does_not_pay() -> None:
     gate = Gate(3.0, 1.0, 7.0, "episode", harm=False, passed=True)
     found = [Grouping("drag", "ball", 30.2, gate, pays=True), Grouping("leak", "day", 20.0, gate, pays=True)]
-    terms = [SimpleNamespace(effect="drag", groupings=("c",)), SimpleNamespace(effect="leak", groupings=())]
+    by = SimpleNamespace(by="ball")
+    terms = [SimpleNamespace(effect="drag", groupings=(by,)), SimpleNamespace(effect="leak", groupings=())]
     search = object.__new__(Search)
     search.terms = terms  # type: ignore[assignment]
     chosen = Trial((0, 1), cast(Any, None))
     said = confirmed(found, search, chosen)
+    own = Grouping("", "ball", 9.0, gate, pays=True, parameter="b")
     assert [g.pays for g in said] == [True, False]
+    assert confirmed([own], search, chosen) == [own]
     assert sentence_of(said[1:]) == (
         " Grouping leak by day does not pay (+20 nats, but a search with it chose otherwise)."
     )
+
+
+def test_rivals_of_an_effect_that_only_differing_explains_differ_as_well() -> None:
+    gate = Gate(3.0, 1.0, 7.0, "episode", harm=False, passed=True)
+    names = ("drag", "dry_friction", "leak")
+    effects = [Expression(n, acts_on="x", term="-c*x", parameters={"c": {"range": [0, 1]}}) for n in names]
+    found = [
+        Grouping("drag", "ball", 30.0, gate, pays=True, accepted=False),
+        Grouping("dry_friction", "ball", 28.0, None, pays=False, accepted=False),
+        Grouping("leak", "ball", 20.0, None, pays=False, accepted=False),
+    ]
+    assert [e.per for e in grouped_effects(effects, found)] == ["ball", "ball", ""]
+    assert [e.per for e in grouped_effects(effects, [g._replace(accepted=True) for g in found])] == ["ball", "", ""]

@@ -54,14 +54,15 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     folds = (
         [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))] if len(order) > 1 else []
     )
-    hypotheses = [Hypothesis(t.optimum.z, search.free(t.terms), 1.0 - out) for out in folds for t in trials]
+    hypotheses = [Hypothesis(t.optimum.z, t.optimum.free, 1.0 - out) for out in folds for t in trials]
     found = search.fitter(hypotheses)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out. What a group is that
     # was held out as a whole, only its own rows can tell, at the price that its population asks
     unseen = [_unseen(search, h.free, windows, h.weight > 0) for h in hypotheses]
     found = search.fitter(
         [
-            Hypothesis(o.z, search.noise + tuple(new), 1 - hypothesis.weight)
+            # a group that begins at the common value is far off: with quiet noise its fit would creep
+            Hypothesis(search.loud(o.z) if new else o.z, search.noise + tuple(new), 1 - hypothesis.weight)
             for o, hypothesis, new in zip(found, hypotheses, unseen, strict=True)
         ]
     )

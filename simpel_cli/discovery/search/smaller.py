@@ -1,5 +1,7 @@
 """Programs with few terms or none beside the whole one: they compile and run in a fraction of its time."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -13,9 +15,9 @@ def fitter_of(plan: Setup, side_by_side: int, room: int) -> Fitter:
     return Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=side_by_side, width=width)
 
 
-def small_search(plan: Setup, side_by_side: int, room: int) -> Search:
-    """Return a search in a program of its own, with room as of `fitter_of`."""
-    return Search(plan, fitter_of(plan, side_by_side, room))
+def small_search(plan: Setup, side_by_side: int, room: int, alike: Sequence[int] = ()) -> Search:
+    """Return a search in a program of its own, with room as of `fitter_of`; alike: as of `Search`."""
+    return Search(plan, fitter_of(plan, side_by_side, room), alike=alike)
 
 
 def fitted_again(small: Search, search: Search, chosen: Trial) -> Trial:

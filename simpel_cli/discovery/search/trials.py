@@ -53,23 +53,39 @@ class Stage(NamedTuple):
 
 
 class Search:
-    """The search over sets of effects of one setup."""
+    """The search over sets of effects of one setup.
 
-    def __init__(self, plan: Setup, fitter: Fitter | Spreading, report: Callable[[str], None] = lambda _: None) -> None:
+    Args:
+        plan: what it works with.
+        fitter: of its program.
+        report: takes a line.
+        alike: spreads of parameters of the simulator whose groups have one value until a hypothesis frees them; `plan.start`
+            has none for them.
+    """
+
+    def __init__(
+        self,
+        plan: Setup,
+        fitter: Fitter | Spreading,
+        report: Callable[[str], None] = lambda _: None,
+        alike: Sequence[int] = (),
+    ) -> None:
         self.plan, self.report = plan, report
         self.terms = plan.augmented.terms
         n_p, n_r, n_q = plan.coordinates.sizes
         params = plan.augmented.model.params
-        self.own = spreads_of(params)
-        last = {rows[-1] + 1 for rows in self.own.values()}  # of what was never seen the data tell nothing
-        self.always = tuple(i for i in range(len(params)) if i not in self.own and i not in last)
+        every = spreads_of(params)
+        self.own = {row: rows for row, rows in every.items() if row not in alike}
+        last = {rows[-1] + 1 for rows in every.values()}  # of what was never seen the data tell nothing
+        self.still = tuple(i for row in alike for i in (row, *every[row]))
+        self.always = tuple(i for i in range(len(params)) if i not in every and i not in {*last, *self.still})
         self.always += tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         differing = [plan.augmented.spreads(t) for t in self.terms]
         self.members = [tuple(i for own in each.values() for i in own[:-1]) for each in differing]
-        self.spreads = self.own | {row: own[:-1] for each in differing for row, own in each.items()}
-        self.slot_of = _slots(plan, self.own)
+        self.spreads = every | {row: own[:-1] for each in differing for row, own in each.items()}
+        self.slot_of = _slots(plan, every)
         self.spreads_of = [tuple(each) for each in differing]
         inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
@@ -143,6 +159,7 @@ class Search:
         for _ in range(STARTS - 1 if self.plan.optimum is None else 0):
             z = self.plan.start.copy()
             z[:n] = random.uniform(0.1, 0.9, n)
+            z[list(self.still)] = self.plan.start[list(self.still)]
             starts.append(z)
         found = self.fitter([Hypothesis(z, self.free(()), self.ones) for z in starts])
         if not any(np.isfinite(o.log_evidence) for o in found):

@@ -1,0 +1,141 @@
+"""Whether parameters of the simulator differ from group to group, where columns of the data name groups.
+
+It is asked of the simulator alone before any effect, since one value for all groups leaves what looks like effects, and again
+beside the effects that were chosen, since a missing effect may look like parameters that differ. All parameters differ in one
+small program per column, and none does until a hypothesis says so.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from simpel_cli.discovery.search.grouping import Grouping, Question, judged
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.smaller import carried, small_search
+from simpel_cli.discovery.search.spreads import respread
+from simpel_cli.discovery.search.trials import SPREADS, Search, Trial
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.initial_states import begun
+from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.setup import Setup
+from simpel_cli.filtering.tracks import Tracks
+from simulators.groups import SPREAD, grouped, spreads_of
+from simulators.model import Model
+
+Attach = Callable[..., Setup]  # (model, kept, extra) -> the setup of a program with these terms alone
+
+
+def with_own(model: Model, per: Mapping[str, str]) -> Model:
+    """Return the simulator whose parameters differ from group to group as it says itself, and these as well.
+
+    Args:
+        model: of measurements with groups.
+        per: parameter -> column of the groups.
+    """
+    assert model.base is not None
+    base = replace(model.base, per={**model.base.per, **per}, between_rows=model.between_rows, latency=model.latency)
+    return grouped(base, model.groups)
+
+
+def own_parameters(
+    attach: Attach, model: Model, options: Discovery, beside: tuple[Search, Trial] | None = None
+) -> list[Grouping]:
+    """Return what it is worth that each parameter of the simulator differs, by each column of groups.
+
+    What pays stays when the next is asked; of several columns the one that explains most comes first.
+
+    Args:
+        attach: binds the measurements.
+        model: of measurements with groups, as it was declared.
+        options: of the search.
+        beside: a search and the effects that it chose; None: the simulator alone.
+    """
+    late = {*model.delay.values(), *model.lag.values()}
+    names = [q.name for q in (model.base.params if model.base else ()) if q.name not in {*model.per, *late}]
+    left, taken, found = list(model.groups), dict[str, str](), dict[tuple[str, str], Grouping]()
+    while left and names:
+        asked = {by: _asked(attach, with_own(model, taken | dict.fromkeys(names, by)), by, names, options, beside)
+                 for by in left}  # fmt: skip
+        best = max(left, key=lambda by: sum(g.gain for g in asked[by] if g.pays))
+        found |= {(g.parameter, by): g._replace(pays=g.pays and by == best) for by in left for g in asked[by]}
+        pays = {g.parameter: best for g in asked[best] if g.pays}
+        if not pays:
+            break
+        taken |= pays
+        names = [name for name in names if name not in pays]
+        left.remove(best)
+    return list(found.values())
+
+
+def per_of(found: list[Grouping]) -> dict[str, str]:
+    """Return the parameters of the simulator for which it pays, with the column of their groups."""
+    return {g.parameter: g.per for g in found if g.parameter and g.pays}
+
+
+def in_common(search: Search, base: Trial, per: Mapping[str, str]) -> Trial:
+    """Return a simulator's fit in which parameters that differ have one value for all groups."""
+    rows = {q.name: i for i, q in enumerate(search.plan.augmented.params)}
+    spreads = [rows[f"{name}_{SPREAD}"] for name in per]
+    members = {i for row in spreads for i in search.own[row]}
+    z = search.loud(base.optimum.z)
+    z[spreads], z[list(members)] = 0.0, 0.5
+    free = tuple(i for i in base.optimum.free if i not in members)
+    (alike,) = search.fitter([Hypothesis(z, free, search.ones)])
+    return Trial(base.terms, alike)
+
+
+def written(sim: dict[str, Any], per: Mapping[str, str]) -> dict[str, Any]:
+    """Return the `sim:` node whose parameters differ; one that is built on another says so where it is declared."""
+    own = sim.get("parameters") or {}
+    here = {name: own[name] | {"per": by} for name, by in per.items() if isinstance(own.get(name), dict)}
+    node = sim | ({"parameters": own | here} if here else {})
+    deeper = {name: by for name, by in per.items() if name not in here}
+    return node | ({"base": written(sim["base"], deeper)} if deeper and isinstance(sim.get("base"), dict) else {})
+
+
+def _asked(
+    attach: Attach,
+    model: Model,
+    by: str,
+    names: Sequence[str],
+    options: Discovery,
+    beside: tuple[Search, Trial] | None,
+) -> list[Grouping]:
+    """Ask in one program of the parameters that differ by one column."""
+    own = [beside[0].terms[t] for t in beside[1].terms] if beside else []
+    plan = attach(model, kept=frozenset(), extra=own)
+    rows = {q.name: i for i, q in enumerate(model.params)}
+    spreads = {name: rows[f"{name}_{SPREAD}"] for name in names}
+    of_groups = spreads_of(model.params)
+    start = plan.start.copy() if beside is None else carried(beside[0].plan, beside[1].optimum.z, plan)
+    for row in spreads.values():
+        start[row] = 0.0
+        start[of_groups[row]] = 0.5  # in the middle of the population
+    windows = begun(Tracks(plan), start, plan.windows) if beside is None else beside[0].plan.windows
+    room = sum(len(t.parameters) + sum(len(g.own) for g in t.groupings) for t in own)
+    small = small_search(
+        plan._replace(start=start, windows=windows), options.lanes, max(room, 1), alike=tuple(spreads.values())
+    )
+    terms = tuple(range(len(own)))
+    if beside is None:
+        alike = small.base()
+    else:
+        alike = small.best(terms, small.fitter([Hypothesis(start, small.free(terms), small.ones)]))
+
+    def question(name: str) -> Question:
+        def trials(at: Trial) -> tuple[Trial, list[Trial]]:
+            return _differing(small, at, spreads[name]), [at]
+
+        return Question(Grouping("", by, 0.0, None, pays=False, parameter=name), trials)
+
+    return judged(small, Assessor(small.plan, options.horizon), alike, [question(name) for name in names], len(names))
+
+
+def _differing(small: Search, at: Trial, spread: int) -> Trial:
+    """Return the model in which one more parameter differs."""
+    members = small.spreads[spread]
+    free = (*at.optimum.free, *members)
+    z = small.loud(at.optimum.z)
+    starts = [respread(small.plan.coordinates, z, {spread: level}, {spread: members}) for level in SPREADS]
+    found = small.fitter([Hypothesis(start, free, small.ones) for start in starts])
+    return Trial(at.terms, max(found, key=lambda o: o.log_evidence))

@@ -1,0 +1,84 @@
+"""Whether parameters of the simulator differ from group to group, asked by a search itself, on planted groups."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from command_line import simpel
+from test_effects_by_group import CART, DATA
+
+from simpel_cli.discovery.search.own_parameters import written
+
+
+def discovered(folder: Path, rig: str, rate: str, *words: str) -> dict[str, Any]:
+    """Carts whose simulator is v' = b u; the verdict of a search that nobody told of the rigs but the data."""
+    for group in ("sim", "data"):
+        (folder / "my" / group).mkdir(parents=True)
+    more = ", f: {unit: m/s^2, range: [-2, 2]}"
+    (folder / "my/sim/plant.yaml").write_text(CART.format(name="plant", more=more, rate=rate))
+    (folder / "my/sim/cart.yaml").write_text(CART.format(name="cart", more="", rate="b*u"))
+    text = DATA.format(path=folder / "made/measurements.parquet")
+    (folder / "my/data/cart.yaml").write_text(f"{text}groups: [rig]\n")
+    made = simpel(
+        folder, "simulate", "--config-dir", "my", "sim=plant", "simulation.episodes=16", "simulation.steps=40",
+        "simulation.seed=1", "simulation.noise_std={s: 0.005, v: 0.01}", "simulation.truth={b: 1.3, f: 0}",
+        "simulation.initial={s: [-0.2, 0.2], v: [-1, 1]}", f"simulation.groups={{rig: {rig}}}", "out=made",
+    )  # fmt: skip
+    assert made.code == 0, made.err
+    found = simpel(
+        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", "close=false", "report=false",
+        "discovery.pairs=false", "hydra.run.dir=run", *words,
+    )  # fmt: skip
+    assert found.code == 0, found.err
+    (folder / "screen").write_text(found.out)
+    verdict: dict[str, Any] = json.loads((folder / "run" / "verdict.json").read_text())
+    return verdict
+
+
+def test_gains_of_rigs_differ_and_nothing_is_missing(tmp_path: Path) -> None:
+    """One gain for all rigs would leave a force that goes with the input."""
+    gains = "{count: 6, parameters: {b: {law: normal, std: 0.26}}}"
+    verdict = discovered(tmp_path, gains, "b*u", "effect=[input_dead_zone,quadratic_input]")
+    assert (verdict["verdict"], verdict["effects"]) == ("none", [])
+    (one,) = (g for g in verdict["grouping"] if g["pays"])
+    assert (one["parameter"], one["per"], one["gate"]["passed"]) == ("b", "rig", True)
+    assert f"Grouping b by rig pays (+{one['gain']:.0f} nats). b differs from rig to rig" in verdict["summary"]
+    truth = yaml.safe_load((tmp_path / "made/card.yaml").read_text())["truth_by_group"]["rig"]
+    (group,) = verdict["groups"]
+    assert group["key"] == "sim.parameters.b.per"
+    for name, own in group["values"].items():
+        assert own["value"] == pytest.approx(truth[name]["b"], rel=0.02)
+    before, after = (verdict["error"][when]["horizon"]["v"] for when in ("before", "after"))
+    assert after < 0.012 < 0.05 < before
+    assert [step["added"] for step in verdict["steps"]] == [[], ["b by rig"]]
+    assert verdict["corrected_sim"] == "conf/sim/cart_by_rig.yaml"
+    node = yaml.safe_load((tmp_path / "run" / verdict["corrected_sim"]).read_text())
+    assert node["parameters"]["b"]["per"] == "rig"
+    assert "sim=cart_by_rig" in (tmp_path / "screen").read_text()
+
+
+def test_a_force_of_every_rig_that_is_none_on_average(tmp_path: Path) -> None:
+    """With one value for all rigs it explains nothing; the gain does not stand in for it."""
+    forces = "{count: 6, parameters: {f: {law: normal, std: 0.5}}}"
+    verdict = discovered(tmp_path, forces, "b*u + f", "effect=[constant_load,cubic_stiffness]")
+    assert [e["name"] for e in verdict["effects"]] == ["constant_load"]
+    (load,) = (g for g in verdict["grouping"] if g["effect"] == "constant_load")
+    assert (load["pays"], load["accepted"]) == (True, False)
+    assert not any(g["pays"] for g in verdict["grouping"] if g["parameter"])
+    truth = yaml.safe_load((tmp_path / "made/card.yaml").read_text())["truth_by_group"]["rig"]
+    (group,) = verdict["groups"]
+    for name, own in group["values"].items():
+        assert own["value"] == pytest.approx(truth[name]["f"], abs=0.02)
+
+
+def test_where_it_is_declared() -> None:
+    own = {"name": "s", "parameters": {"b": {"range": [0, 1]}, "m": 2.0}}
+    assert written(own, {"b": "rig"})["parameters"] == {"b": {"range": [0, 1], "per": "rig"}, "m": 2.0}
+    assert own["parameters"]["b"] == {"range": [0, 1]}  # type: ignore[index]
+    on = {"name": "t", "base": own, "parameters": {"c": {"range": [0, 1]}}}
+    found = written(on, {"b": "rig", "c": "day"})
+    assert found["base"]["parameters"]["b"]["per"] == "rig"
+    assert found["parameters"] == {"c": {"range": [0, 1], "per": "day"}}
+    assert written(own, {}) == own
