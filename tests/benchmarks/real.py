@@ -5,10 +5,13 @@ version, which searches the same recordings in the words that it knows.
 """
 
 import argparse
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from tests.benchmarks.cost import searched
 
@@ -25,10 +28,9 @@ EXPERIMENTS = (
 )
 CLOSED = ("free_pendulum", "emps", "rc_car_bicycle")  # SimPEL with the old and the corrected simulator, too
 WORDS = {"rc_car_bicycle": ("effect=[vehicle]",)}
-DESCRIBED = {
-    "ball_drops": ("effect.quadratic_drag.per=ball",)
-}  # what its recording is, in words that older versions lack
+DESCRIBED = {"ball_drops": ("effect.quadratic_drag.per=ball",)}  # in words that older versions lack
 TARGETS = {"sim": "simulators.model.Declared", "data": "simpel_cli.data.Measurements"}  # older versions ask for them
+TEST_PARTS = re.compile(r"split: \{column: split, test: \[(\w+)\]\}")
 NEW_KEYS = re.compile(r",? *between_rows: \w+")
 
 
@@ -46,12 +48,24 @@ def run_before(name: str, version: Path, out: Path) -> dict[str, Any]:
         folder = out / "conf"
         for group in ("sim", "data", "experiment"):
             text = NEW_KEYS.sub("", (HERE / "conf" / group / f"{name}.yaml").read_text())
+            if found := TEST_PARTS.search(text):
+                text = TEST_PARTS.sub("split: {column: split}", text).replace(*_relabelled(name, found[1], out))
             file = folder / group / f"{name}.yaml"
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(f"_target_: {TARGETS[group]}\n{text}" if group in TARGETS else text)
         written = ("--config-dir", str(folder))
     words = [*written, f"experiment={name}", "close=false", *WORDS.get(name, ())]
     return searched(words, out / f"{name}_before", {"PYTHONPATH": str(version)}, version)
+
+
+def _relabelled(name: str, part: str, out: Path) -> tuple[str, str]:
+    """Write a recording whose test is called `test`, and return how its data YAML names it, and the new file."""
+    file = f"data/{name}/measurements.parquet"
+    table = pd.read_parquet(Path(os.environ["SIMPEL_SHARED"]) / file)
+    table["split"] = table["split"].replace({part: "test"})
+    copy = out / f"{name}.parquet"
+    table.to_parquet(copy)
+    return "${simpel_shared:}/" + file, str(copy)
 
 
 def row(name: str, found: dict[str, Any]) -> str:
