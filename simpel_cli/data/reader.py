@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from simpel_cli.data.checks import clock, sensors, values
-from simpel_cli.data.checks.noise import runs, third_difference_std
+from simpel_cli.data.checks.noise import runs
 from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
+from simpel_cli.data.column_noise import Told, column, column_noise, inside, noise_check
 from simpel_cli.data.config import Measurements
 from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
 from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
@@ -115,19 +116,19 @@ def _recorded(
     finite, rows = values.finite(rows, measured, _column_names(config, model, mapping), partial=partial)
     split, rows = assign(*by_file(config, table, base), rows, dynamic, config.seed_or(seed))
     report += [finite, split]
-    told = values.filled(rows)
-    report += [check(told, model, mapping.outputs) for check in (values.constant, values.ranges)]
+    filled = values.filled(rows)
+    report += [check(filled, model, mapping.outputs) for check in (values.constant, values.ranges)]
     groups: dict[str, tuple[str, ...]] = {}
     if isinstance(model, Model) and model.columns_of_groups:
         groups = known or group_names(model, table, rows)
         rows = with_groups(rows, table, groups)
     if config.layout == "transitions":
         parts = {part: _pairs(config, model, rows, part) for part in PARTS}
-        noise: dict[str, float] = {}  # rows that do not follow each other tell nothing of it
+        told = Told({}, {}, {})  # rows that do not follow each other tell nothing of it
         computed: tuple[str, ...] = config.derived
     else:
         report.append(clock.monotonic(rows, table, config))
-        parts, noise, more, computed = _trajectories(config, model, rows, mapping, whole, partial=partial)
+        parts, told, more, computed = _trajectories(config, model, rows, mapping, whole, partial=partial)
         report += more
     for part, episodes in parts.items():
         if not episodes and not (part == "test" and config.all_train):
@@ -138,12 +139,13 @@ def _recorded(
         train=parts["train"],
         test=parts["test"],
         outputs=mapping.outputs,
-        noise_std=noise | {name: float(std) for name, std in config.noise_std.items()},
+        noise_std=told.std | {name: float(std) for name, std in config.noise_std.items()},
         estimated=mapping.unmeasured,
         checks=tuple(report),
         files=tuple(dict.fromkeys((*table.files, *(f for other in joined for f in other.table.files), *cards))),
         derived=tuple(name for name in computed if name in mapping.columns),
         groups=groups,
+        least_noise=told.least,
     )
 
 
@@ -161,7 +163,7 @@ def _refuse_silent(mapping: Mapping, states: list[str], train: tuple[Episode, ..
 
 def _trajectories(
     config: Measurements, model: Source, rows: Rows, mapping: Mapping, whole: bool, *, partial: bool
-) -> tuple[dict[str, tuple[Episode, ...]], dict[str, float], list[Check], tuple[str, ...]]:
+) -> tuple[dict[str, tuple[Episode, ...]], Told, list[Check], tuple[str, ...]]:
     """Episodes by split, noise by quantity, checks, states whose column was computed from another."""
     as_they_are = partial and not whole
     sampling, raw, longest = clock.sampling(rows, model, config, as_they_are=as_they_are)
@@ -187,7 +189,7 @@ def _trajectories(
         episodes, of_slope, check = estimate_speeds(model, episodes, mapping.unmeasured, raw, required=whole)
         report.append(check)
     part_of = {episode.name: tag for tag, episode in tagged}
-    noise, steps = _noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
+    told = column_noise(config, model, mapping, [episode for episode in episodes if part_of[episode.name] == "train"])
     gain = 1.0
     if config.resample is not None:
         episodes, gain, check = resample(
@@ -195,12 +197,13 @@ def _trajectories(
         )
         report.append(check)
     # the slope of a spline is smooth already: the filter takes nothing more from it
-    noise = {name: std * gain for name, std in noise.items()} | {
-        speed: noise[position] * factor for speed, (position, factor) in of_slope.items() if position in noise
+    noise = {name: std * gain for name, std in told.std.items()} | {
+        speed: told.std[position] * factor for speed, (position, factor) in of_slope.items() if position in told.std
     }
+    told = told._replace(std=noise, least={name: std * gain for name, std in told.least.items()})
     kept, short = _long_enough(config, model, episodes)
-    report += [short, _noise_check(config, model, noise, steps)]
-    return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, noise, report, computed
+    report += [short, noise_check(config, model, told)]
+    return {part: tuple(e for e in kept if part_of[e.name] == part) for part in PARTS}, told, report, computed
 
 
 def _sensors(
@@ -223,7 +226,7 @@ def _sensors(
 
     observed = (*model.states, *(q for q in model.outputs if q.name in mapping.outputs))
     measured = [(i, q.name) for i, q in enumerate(observed) if q.name in mapping.columns]
-    columns = {name: [there(_column(s, i)) for s in segments] for i, name in measured}
+    columns = {name: [there(column(s, i)) for s in segments] for i, name in measured}
     moving = {name: [part for s in segments for part in _moving(s, i, together)] for i, name in measured}
     units = {q.name: q.unit for q in observed}
     times = [segment.time for segment in segments]
@@ -244,21 +247,9 @@ def _sensors(
     return found, tuple(dict.fromkeys([*config.derived, *differences(motions)]))
 
 
-def _column(episode: Episode, i: int) -> np.ndarray:
-    """Values of a state, or behind them an output, (T,)."""
-    values: np.ndarray = np.concatenate([episode.states, episode.outputs], axis=1)[:, i]
-    return values
-
-
-def _inside(episode: Episode, i: int) -> np.ndarray:
-    """Values of a state or an output, NaN where they lie at an end of their sensor, (T,)."""
-    values = _column(episode, i)
-    return values if episode.beyond is None else np.where(episode.beyond[:, i] != 0, np.nan, values)
-
-
 def _moving(episode: Episode, i: int, together: bool) -> list[np.ndarray]:
     """Pieces of a column between the values at an end of its sensor, which repeats those as it should."""
-    values = _inside(episode, i)
+    values = inside(episode, i)
     if not together:
         return [values[np.isfinite(values)]]
     return [values] if episode.beyond is None else runs(values)
@@ -333,47 +324,6 @@ def _long_enough(config: Measurements, model: Source, episodes: tuple[Episode, .
         f"{short} of {len(episodes)} segments shorter than {least} rows dropped" if short else f"{len(kept)} segments"
     )
     return kept, Check("length", short == 0, detail)
-
-
-def _noise(
-    config: Measurements, model: Source, mapping: Mapping, train: list[Episode]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Standard deviation of the noise per measured state and output, declared or estimated, before any filter.
-
-    Third differences of values that repeat say almost nothing: an estimate is at least step/sqrt(12), the error of rounding.
-
-    Returns:
-        The noise, and the steps that it comes from where it does.
-    """
-    names = [q.name for q in model.states] + list(mapping.outputs)
-    std, steps = {}, {}
-    for i, name in enumerate(names):
-        if name not in mapping.columns:
-            continue
-        value = config.noise_std.get(name)
-        if value is None:
-            columns = [_inside(episode, i) for episode in train]
-            step = sensors.coarse_step([column[np.isfinite(column)] for column in columns])
-            value = third_difference_std(columns)
-            if step / 12**0.5 > value:
-                value = step / 12**0.5
-                steps[name] = step
-        if np.isfinite(value):
-            std[name] = float(value)
-    return std, steps
-
-
-def _noise_check(config: Measurements, model: Source, noise: dict[str, float], steps: dict[str, float]) -> Check:
-    units = {q.name: q.unit for q in (*model.states, *model.outputs)}
-
-    def said(name: str, std: float) -> str:
-        value = f"{config.noise_std.get(name, std):.3g} {units[name]}".rstrip()
-        if name in config.noise_std:
-            return f"{name} {value} (declared)"
-        return f"{name} {value}" + (f" (rounding to steps of {steps[name]:.3g})" if name in steps else "")
-
-    shown = [said(name, std) for name, std in noise.items()]
-    return Check("noise", bool(shown), ", ".join(shown) if shown else "too few rows to estimate it")
 
 
 def _column_names(config: Measurements, model: Source, mapping: Mapping) -> tuple[str, ...]:

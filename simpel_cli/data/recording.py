@@ -55,6 +55,7 @@ class Recording(NamedTuple):
     files: tuple[Path, ...]  # what was read
     derived: tuple[str, ...] = ()  # names of the states whose column was computed from another one's
     groups: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  column -> names of the groups that were trained on
+    least_noise: dict[str, float] = {}  # noqa: RUF012  per state and output, that of rounding: no estimate can be below
 
 
 class Transitions(NamedTuple):

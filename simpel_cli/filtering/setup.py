@@ -120,6 +120,7 @@ def setup(
         np.array([scales.size[name] for name in measured]),
         typical * Q_BOUNDS[0],
         typical * Q_BOUNDS[1],
+        np.array([recording.least_noise.get(name, 0.0) for name in measured]),
     )
     n_p, n_r, n_q = coordinates.sizes
     start = np.full(len(coordinates.low), 0.5)

@@ -8,6 +8,7 @@ import pytest
 
 from simpel_cli.data import Measurements, Recording, read
 from simpel_cli.data.checks.noise import third_difference_std
+from simpel_cli.filtering.setup import setup
 from simulators.model import Declared, Model
 
 STEP, NOISE = 0.3, 0.02
@@ -49,6 +50,16 @@ def test_fine_steps_change_nothing(tmp_path: Path, step: float) -> None:
     recording, y = recorded(tmp_path, step)
     assert recording.noise_std["y"] == third_difference_std([y])
     assert "rounding" not in said(recording)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.05, STEP])
+def test_no_estimate_is_below_the_error_of_rounding(tmp_path: Path, step: float) -> None:
+    recording, _ = recorded(tmp_path, step, noise=0.05)
+    assert recording.least_noise == {"y": pytest.approx(step / 12**0.5, rel=0.01)}
+    plan = setup(sensor(), recording, (), [])
+    row = plan.coordinates.sizes[0]  # of the noise of y
+    assert plan.coordinates.value(row, 0.0) >= 0.99 * step / 12**0.5
+    assert recorded(tmp_path, step, noise_std={"y": NOISE})[0].least_noise == {}
 
 
 def test_a_declared_noise_stays(tmp_path: Path) -> None:

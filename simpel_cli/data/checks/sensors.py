@@ -125,10 +125,10 @@ def held(pieces: Sequence[np.ndarray]) -> tuple[float, float]:
     Returns:
         Their share, and the usual number of equal rows.
     """
-    changes = _changes(pieces)
-    if len(changes) < FEW_RUNS:
+    sizes = changes(pieces)
+    if len(sizes) < FEW_RUNS:
         return 0.0, 1.0
-    least = max(JUMP * float(changes.min()), SMALL * float(np.median(changes)))
+    least = max(JUMP * float(sizes.min()), SMALL * float(np.median(sizes)))
     runs: list[np.ndarray] = []
     for piece in pieces:
         step = np.abs(np.diff(piece))
@@ -150,19 +150,19 @@ def quantum(pieces: Sequence[np.ndarray]) -> float:
     Args:
         pieces: contiguous rows, angles unwrapped, each (T,).
     """
-    changes = _changes(pieces)
-    if len(changes) < FEW_RUNS:
+    sizes = changes(pieces)
+    if len(sizes) < FEW_RUNS:
         return float("nan")
-    q = float(np.quantile(changes, 0.01, method="lower"))  # not the least: an angle that wraps makes a few odd ones
-    multiples = changes / q
+    q = float(np.quantile(sizes, 0.01, method="lower"))  # not the least: an angle that wraps makes a few odd ones
+    multiples = sizes / q
     whole = np.abs(multiples - np.round(multiples)) < 0.02 * np.clip(multiples, 1.0, 10.0)
     # a ramp without noise has equal changes too, but it never pauses and never makes two at once
-    stepped = len(changes) < sum(max(len(piece) - 1, 0) for piece in pieces) or bool(np.any(multiples > 1.5))
+    stepped = len(sizes) < sum(max(len(piece) - 1, 0) for piece in pieces) or bool(np.any(multiples > 1.5))
     return q if np.mean(whole) >= GRID_SHARE and stepped else float("nan")
 
 
-def _changes(pieces: Sequence[np.ndarray]) -> np.ndarray:
+def changes(pieces: Sequence[np.ndarray]) -> np.ndarray:
     """Sizes of the changes from a row to the next, without zeros and what is rounding of the stored numbers."""
-    changes = np.concatenate([np.abs(np.diff(piece)) for piece in pieces]) if pieces else np.empty(0)
+    sizes = np.concatenate([np.abs(np.diff(piece)) for piece in pieces]) if pieces else np.empty(0)
     size = max((float(np.max(np.abs(piece))) for piece in pieces if len(piece)), default=0.0)
-    return changes[changes > 1e-9 * size]
+    return sizes[sizes > 1e-9 * size]

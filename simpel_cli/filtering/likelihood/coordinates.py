@@ -89,6 +89,7 @@ def coordinates_of(
     size: np.ndarray,
     q_low: np.ndarray,
     q_high: np.ndarray,
+    least: np.ndarray | None = None,
 ) -> Coordinates:
     """Return the coordinates of all unknowns.
 
@@ -100,7 +101,9 @@ def coordinates_of(
         size: (ny,) magnitude of the channel.
         q_low: (n_driven,) lower bounds of the process noise.
         q_high: (n_driven,) upper bounds.
+        least: (ny,) error of rounding, which a noise that was estimated cannot be below; None: unknown.
     """
+    least = np.zeros(len(r)) if least is None else least
     rows: list[tuple[float, float, bool, bool]] = []  # low, high, log, normal
     base = len(augmented.model.params)
     for i, q in enumerate(augmented.params):
@@ -111,9 +114,10 @@ def coordinates_of(
         else:
             middle, sd = (low + high) / 2, (high - low) / 4
             rows.append((middle - CUT * sd, middle + CUT * sd, prior == "lognormal", True))
-    for value, known, most in zip(r, declared, MODEL_ERROR * size, strict=True):
+    for value, known, most, rounded in zip(r, declared, MODEL_ERROR * size, least, strict=True):
         low, high = value * (np.exp(np.array([-CUT, CUT]) * DECLARED_SD) if known else np.array(ESTIMATED_SPAN))
-        rows.append((np.log(low), np.log(high if known else max(high, most)), True, bool(known)))
+        low, high = (low, high) if known else (max(low, rounded), max(high, most, 2 * rounded))
+        rows.append((np.log(low), np.log(high), True, bool(known)))
     rows += [(np.log(low), np.log(high), True, False) for low, high in zip(q_low, q_high, strict=True)]
     rows.append((0.0, 1.0, False, False))  # padding
     states = [q.name for q in augmented.model.states]
