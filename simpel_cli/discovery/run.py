@@ -37,8 +37,8 @@ from simpel_cli.discovery.search.latency import sentence_of as sentence_of_laten
 from simpel_cli.discovery.search.own_parameters import in_common, own_parameters, per_of, with_own, written
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.smaller import fitter_of, small_search
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.corrected import corrected
@@ -167,13 +167,18 @@ def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str,
     names = [*(q.name for q in model.states), *study.recording.outputs]
     columns = {name: names.index(name) for name in ranges}
     longest = {name: high for name, (_, high) in ranges.items()}
+    known: list[tuple[Setup, Trial]] = []  # the best calibration so far: another latency moves it little
 
     def evidence(at: Mapping[str, float]) -> float:
         own = replace(measurements, latency=dict(measurements.latency) | dict(at))
         recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
         recording = _counted(same_readings(recording, columns, at, longest, model.dt), study)
         plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
-        return float(small_search(plan, options.lanes, 1).base().optimum.log_evidence)
+        optimum = carried(known[-1][0], known[-1][1].optimum.z, plan) if known else None
+        base = small_search(plan._replace(optimum=optimum), options.lanes, 1).base()
+        if not known or base.optimum.log_evidence > known[-1][1].optimum.log_evidence:
+            known.append((plan, base))
+        return float(base.optimum.log_evidence)
 
     found = estimated(evidence, ranges, model.dt)
     terminal.line(in_words_of_latency(found), "latency")

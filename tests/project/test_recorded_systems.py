@@ -12,7 +12,7 @@ from systems import model
 
 from simpel_cli.dynamics.transition import encoding_of, transition
 
-EXPERIMENTS = ("rc_car", "emps", "cascaded_tanks", "ball_drops", "free_pendulum")
+EXPERIMENTS = ("rc_car", "emps", "cascaded_tanks", "ball_drops", "free_pendulum", "silverbox", "tclab")
 
 
 def step(name: str, state: list[float], inputs: list[float], **known: float) -> np.ndarray:
@@ -60,6 +60,28 @@ def test_a_ball_falls_along_a_parabola() -> None:
     dt = 1 / 15
     after = step("ball_drops", [40.0, -3.0], [])
     np.testing.assert_allclose(after, [40 - 3 * dt - 9.81 * dt**2 / 2, -3 - 9.81 * dt], rtol=1e-12)
+
+
+def test_a_heater_relaxes_towards_where_it_gives_off_what_it_gets() -> None:
+    """T(t) = T_a + a Q/(U A) + (T_0 - T_a - a Q/(U A)) exp(-U A t/(m c)) of either heater; they do not feel each other."""
+    known, start, powers = {"U": 10.0, "a_1": 0.01, "a_2": 0.0075, "T_a": 21.0}, [30.0, 25.0], [80.0, 40.0]
+    rate = 10 * 0.001 / (0.004 * 500)
+    rest = 21 + np.array([0.01, 0.0075]) * powers / (10 * 0.001)
+    np.testing.assert_allclose(
+        step("tclab", start, powers, **known), rest + (start - rest) * np.exp(-3 * rate), rtol=1e-9
+    )
+
+
+def test_the_silverbox_swings_as_an_oscillator_does() -> None:
+    """exp(A dt) of the companion matrix, about the deflection u/k of the held input."""
+    m, d, k, u, dt = 5.09e-6, 2.2e-4, 0.972, 0.05, 1 / 610.3515625
+    w, damping = np.sqrt(k / m), d / (2 * np.sqrt(k * m))
+    wd, y0, v0 = w * np.sqrt(1 - damping**2), 0.1 - u / k, -20.0
+    decay, (c, s) = np.exp(-damping * w * dt), (np.cos(wd * dt), np.sin(wd * dt))
+    b = (v0 + damping * w * y0) / wd
+    y = decay * (y0 * c + b * s)
+    v = decay * (wd * (b * c - y0 * s)) - damping * w * y
+    np.testing.assert_allclose(step("silverbox", [0.1, v0], [u], m=m, d=d, k=k), [y + u / k, v], rtol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ class Search:
                 "with max(., 1e-9)."
             )
         best = self.best((), found)
-        return self._with_spreads(best) if self.own else best
+        return self._with_spreads(best) if self.own and self.plan.optimum is None else best
 
     def _with_spreads(self, base: Trial) -> Trial:
         """Begin with several spreads of groups, the same share of their ranges, of which each goes on by itself."""
