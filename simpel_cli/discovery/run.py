@@ -185,7 +185,7 @@ def _latencies(study: Study, data_folder: Path, terminal: Terminal) -> dict[str,
     return found
 
 
-def _counted(recording: Recording, study: Study) -> Recording:
+def _counted(recording: Recording, study: Study, *, spikes: bool = False) -> Recording:
     """Return measurements whose values count by the scale of their noise, where `data.noise.scale` says it."""
     source, formulas = study.system.source, dict(study.measurements.noise_scale)
     computed = set(recording.derived) - set(study.recording.estimated)
@@ -193,7 +193,7 @@ def _counted(recording: Recording, study: Study) -> Recording:
     measured = [*recording.outputs, *(q.name for q in source.states)]
     unmeasured = [q.name for q in source.outputs if q.name not in measured]
     scale = noise_scale_of(formulas, encoding_of(source, recording.outputs), [*study.recording.estimated, *unmeasured])
-    return recording if scale is None else scale.counted(recording)
+    return recording if scale is None else scale.counted(recording, spikes=spikes)
 
 
 def _alike(recording: Recording) -> Recording:
@@ -242,7 +242,7 @@ def _search(study: Study, terminal: Terminal, own: list[Grouping] | None = None)
     effects: list[Expression] = groups["effect"]
     terminal.line(f"simpel discover · {model.name} · {len(effects)} effects · {study.device}", style="bold")
     declared_noise = tuple(study.measurements.noise_std)
-    clean = cleaned(_counted(study.recording, study), model, declared_noise)
+    clean = cleaned(_counted(study.recording, study, spikes=True), model, declared_noise)
     # once more: what is typical is not what a lone value would make of it
     clean = clean._replace(recording=_counted(_alike(clean.recording), study))
     recording = clean.recording

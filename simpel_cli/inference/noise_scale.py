@@ -166,26 +166,43 @@ class NoiseScale(NamedTuple):
                 f"e.g. 0.01 + abs({formula})."
             )
 
-    def counted(self, recording: Recording) -> Recording:
+    def counted(self, recording: Recording, *, spikes: bool = False) -> Recording:
         """Return measurements whose values count by the scale of their noise, `Episode.weight`; missing ones stay so.
 
         Of a value that an expression needs and that is missing the middle of its range is taken, of an output, which has
         none, its median.
 
+        Args:
+            recording: measured.
+            spikes: whether single values may be wrong yet: a row in which an expression is no scale counts as the usual one.
+
         Raises:
-            DataError: an expression is no scale somewhere.
+            DataError: an expression is no scale somewhere, or with `spikes` nowhere one.
         """
         outputs = np.concatenate([e.outputs for e in recording.train])
         middles = [q.middle for q in (*self.encoding.states, *self.encoding.inputs)]
         instead = np.array([*middles, *(float(np.nanmedian(column)) for column in outputs.T)])
-        self.refuse_wrong(recording, instead)
+        usual: np.ndarray | None = None
+        if spikes:
+            every = np.concatenate([self.of_episode(e, instead) for e in recording.train])
+            good = (np.isfinite(every) & (every > 0)).mean(axis=0) > 0.5
+            usual = np.array(
+                [np.median(c[np.isfinite(c) & (c > 0)]) if g else np.nan for c, g in zip(every.T, good, strict=True)]
+            )
+        if usual is None or np.isnan(usual).any():
+            self.refuse_wrong(recording, instead)
+
+        def of(episode: Episode) -> np.ndarray:
+            found = self.of_episode(episode, instead)
+            return found if usual is None else np.where(np.isfinite(found) & (found > 0), found, usual)
+
         known = np.concatenate([np.isfinite(np.concatenate([e.states, e.outputs], axis=1)) for e in recording.train])
-        scales = np.concatenate([self.of_episode(e, instead) for e in recording.train])
+        scales = np.concatenate([of(e) for e in recording.train])
         typical = np.sqrt((scales**2 * known).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
         typical = np.where(typical > 0, typical, 1.0)  # of what is never measured nothing counts
 
         def weighed(episode: Episode) -> Episode:
-            weight = np.maximum(self.of_episode(episode, instead) / typical, LEAST) ** -2
+            weight = np.maximum(of(episode) / typical, LEAST) ** -2
             return episode._replace(weight=weight if episode.weight is None else weight * episode.weight)
 
         return recording._replace(train=tuple(map(weighed, recording.train)), test=tuple(map(weighed, recording.test)))

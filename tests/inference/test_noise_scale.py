@@ -128,6 +128,22 @@ def test_windows_count_values_by_their_noise_and_missing_ones_by_the_middle() ->
     assert (found.test[0].weight[:, 0] == 1).all()
 
 
+def test_a_spike_in_what_the_noise_goes_with_is_no_wrong_expression_before_it_is_left_out() -> None:
+    inputs = np.full((40, 1), 2.0)
+    inputs[7] = -30.0
+    train, test = turning(40, 1)._replace(inputs=inputs), turning(10, 2)._replace(inputs=np.full((10, 1), 4.0))
+    measured = Recording((train,), (test,), ("q",), {}, (), (), ())
+    scale = scale_of({"q": "u"})
+    found = scale.counted(measured, spikes=True)
+    np.testing.assert_allclose(found.train[0].weight[:, 2], 1.0)  # type: ignore[index]
+    np.testing.assert_allclose(found.test[0].weight[:, 2], 0.25)  # type: ignore[index]
+    with pytest.raises(DataError, match="is no positive number in 1 of 50 rows"):
+        scale.counted(measured)
+    mostly = measured._replace(train=(train._replace(inputs=-inputs),))
+    with pytest.raises(DataError, match="is no positive number in 39 of 50 rows"):
+        scale.counted(mostly, spikes=True)
+
+
 CART = Encoding((Quantity("s", "m", -5.0, 5.0), Quantity("v", "m/s", -1.0, 1.0)), (Quantity("u", "V", -1.0, 1.0),))
 
 
