@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from simpel_cli.data import Measurements, Recording, read
 from simpel_cli.data.recording import Source
-from simpel_cli.errors import DataError
+from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.evaluation.settings import Evaluation
 from simpel_cli.filtering import estimated_rows
 from simpel_cli.inference.protocols import Method
@@ -14,7 +14,7 @@ from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import Settings, configure
 from simpel_cli.studies.declared import Declared
 from simulators.groups import grouped
-from simulators.model import Model
+from simulators.model import Model, ModelError
 
 
 class Study(NamedTuple):
@@ -93,11 +93,11 @@ def open_study(
     device = configure(declared.settings)
     measurements, source = declared.measurements, declared.source
     if groups and isinstance(source, Model):
-        source = grouped(source, groups)
+        source = _grouped(source, groups)
     # the split does not depend on run.seed: every seed of a sweep is tested on the same episodes
     recording = _read(measurements, source, data_folder, whole=whole)
     if isinstance(source, Model) and recording.groups:
-        source = grouped(source.base or source, recording.groups)
+        source = _grouped(source.base or source, recording.groups)
     return Study(declared, device, system_of(source, recording.outputs, measurements.stack_actions), recording)
 
 
@@ -112,13 +112,25 @@ def _read(measurements: Measurements, source: Source, data_folder: Path, *, whol
     if not estimated_rows.needed(recording, source):
         return recording
     if recording.groups:
-        source = grouped(source.base or source, recording.groups)
+        source = _grouped(source.base or source, recording.groups)
     try:
         return estimated_rows.with_estimates(recording, source, tuple(measurements.noise_std))
     except DataError:
         if estimated_rows.whole(recording):  # with rows that stray a fit is worse, but it is one; the check says so
             return recording
         raise
+
+
+def _grouped(source: Model, groups: dict[str, tuple[str, ...]]) -> Model:
+    """Return the simulator whose parameters differ between the groups of the measurements.
+
+    Raises:
+        ConfigError: a parameter that cannot, or a name that is taken.
+    """
+    try:
+        return grouped(source, groups)
+    except ModelError as error:
+        raise ConfigError(str(error)) from error
 
 
 def refuse_untested(recording: Recording) -> None:

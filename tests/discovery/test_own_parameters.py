@@ -1,6 +1,7 @@
 """Whether parameters of the simulator differ from group to group, asked by a search itself, on planted groups."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,11 @@ import yaml
 from command_line import simpel
 from test_effects_by_group import CART, DATA
 
-from simpel_cli.discovery.search.own_parameters import written
+from simpel_cli.discovery.search.own_parameters import _can_differ, with_own, written
+from simpel_cli.errors import ConfigError
+from simpel_cli.studies.open import _grouped
+from simulators.groups import grouped
+from simulators.model import Declared
 
 
 def discovered(folder: Path, rig: str, rate: str, *words: str) -> dict[str, Any]:
@@ -71,6 +76,23 @@ def test_a_force_of_every_rig_that_is_none_on_average(tmp_path: Path) -> None:
     (group,) = verdict["groups"]
     for name, own in group["values"].items():
         assert own["value"] == pytest.approx(truth[name]["f"], abs=0.02)
+
+
+def test_parameters_that_cannot_differ_are_not_asked_about() -> None:
+    """One that a delay depends on, one that does so already, and one whose spread has a name that is taken."""
+    ranges = {name: {"range": [0.1, 1], "unit": "1"} for name in ("a", "late", "c", "c_spread", "d")}
+    ranges["d"] = ranges["d"] | {"per": "rig"}
+    model = Declared(
+        "m", dt=0.1, states={"x": {"unit": "m", "range": [0, 1]}}, inputs={"u": {"range": [0, 1], "delay": "late"}},
+        parameters=ranges, dynamics={"x": "-a*x*c*d*c_spread + u"},
+    ).model()  # fmt: skip
+    source = grouped(model, {"rig": ("one", "two")})
+    assert [q.name for q in model.params if _can_differ(source, q.name)] == ["a", "c_spread"]
+    with pytest.raises(ConfigError, match="sim: the name c_spread is needed for groups, but it is taken"):
+        _grouped(replace(model, per={"c": "rig"}), {"rig": ("one", "two")})
+    found = with_own(source, {"a": "rig"})
+    assert found.per == {"a": "rig", "d": "rig"}
+    assert found.inputs == source.inputs  # the same rows
 
 
 def test_where_it_is_declared() -> None:

@@ -20,7 +20,7 @@ from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.filtering.tracks import Tracks
 from simulators.groups import SPREAD, grouped, spreads_of
-from simulators.model import Model
+from simulators.model import Model, ModelError
 
 Attach = Callable[..., Setup]  # (model, kept, extra) -> the setup of a program with these terms alone
 
@@ -50,8 +50,7 @@ def own_parameters(
         options: of the search.
         beside: a search and the effects that it chose; None: the simulator alone.
     """
-    late = {*model.delay.values(), *model.lag.values()}
-    names = [q.name for q in (model.base.params if model.base else ()) if q.name not in {*model.per, *late}]
+    names = [q.name for q in (model.base.params if model.base else ()) if _can_differ(model, q.name)]
     left, taken, found = list(model.groups), dict[str, str](), dict[tuple[str, str], Grouping]()
     while left and names:
         asked = {by: _asked(attach, with_own(model, taken | dict.fromkeys(names, by)), by, names, options, beside)
@@ -65,6 +64,14 @@ def own_parameters(
         names = [name for name in names if name not in pays]
         left.remove(best)
     return list(found.values())
+
+
+def _can_differ(model: Model, name: str) -> bool:
+    """Whether a parameter has one value so far, no delay depends on it, and what its groups need to be called is free."""
+    try:
+        return name not in model.per and all(with_own(model, {name: by}) for by in model.groups)
+    except ModelError:
+        return False
 
 
 def per_of(found: list[Grouping]) -> dict[str, str]:
