@@ -79,7 +79,7 @@ class Measurements:
             value at an end says that the quantity is there or beyond: of an output it is trained on and scored as that, of a
             state it is a missing value, and so it is of both in `discover`.
         groups: columns that name groups of episodes, e.g. the ball, the payload, the subject: `discover` asks by itself whether
-            an effect that it chose differs from group to group.
+            parameters of the simulator, or effects, differ from group to group.
 
     Raises:
         ConfigError: a value that is not allowed; the message names `data.<key>`.

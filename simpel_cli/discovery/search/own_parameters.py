@@ -22,6 +22,8 @@ from simpel_cli.filtering.tracks import Tracks
 from simulators.groups import SPREAD, grouped, spreads_of
 from simulators.model import Model, ModelError
 
+MOST_AT_ONCE = 3  # parameters that differ by one column: what the program has room for
+
 Attach = Callable[..., Setup]  # (model, kept, extra) -> the setup of a program with these terms alone
 
 
@@ -119,9 +121,11 @@ def _asked(
         start[row] = 0.0
         start[of_groups[row]] = 0.5  # in the middle of the population
     windows = begun(Tracks(plan), start, plan.windows) if beside is None else beside[0].plan.windows
-    room = sum(len(t.parameters) + sum(len(g.own) for g in t.groupings) for t in own)
+    most, groups = min(len(names), MOST_AT_ONCE), len(model.groups[by])
+    room = sum(len(t.parameters) + sum(len(g.own) for g in t.groupings) for t in own) + most * groups
+    still = sum(1 + len(of_groups[row]) for row in spreads.values())  # unknowns that no fit moves, or few at once
     small = small_search(
-        plan._replace(start=start, windows=windows), options.lanes, max(room, 1), alike=tuple(spreads.values())
+        plan._replace(start=start, windows=windows), options.lanes, room - still, alike=tuple(spreads.values())
     )
     terms = tuple(range(len(own)))
     if beside is None:
@@ -135,7 +139,7 @@ def _asked(
 
         return Question(Grouping("", by, 0.0, None, pays=False, parameter=name), trials)
 
-    return judged(small, Assessor(small.plan, options.horizon), alike, [question(name) for name in names], len(names))
+    return judged(small, Assessor(small.plan, options.horizon), alike, [question(name) for name in names], most)
 
 
 def _differing(small: Search, at: Trial, spread: int) -> Trial:
