@@ -18,7 +18,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install docs demo test test-recordings test-slow check lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
+.PHONY: help install docs demo test test-long test-recordings test-slow check lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -39,12 +39,15 @@ demo: install ## Run the main job (simpel fit experiment=pendulum) and say where
 QUICK := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 
 test: install ## Run the tests (under 12 minutes on two cores)
-	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow and not long"
+
+test-long: install ## Run the tests of 4 s or more (tests/long.txt), which `make test` leaves out and CI runs; 25 minutes
+	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "long and not slow"
 
 test-recordings: install ## Run the tests that need the recordings (SIMPEL_SHARED=FOLDER, or ../shared)
 	XLA_FLAGS="$(QUICK) $$XLA_FLAGS" $(BIN)/python -m pytest -n $(WORKERS) -m "needs_recordings and not slow"
 
-test-slow: install ## Run the long studies that `make test` leaves out
+test-slow: install ## Run the studies that take minutes each
 	$(BIN)/python -m pytest -m slow
 
 check: install ## Before a commit: format, lint, layers, types, quick tests of what changed (under a minute)

@@ -17,6 +17,7 @@ LONGEST = (
     "problem", "uninformative_data", "filter", "own_data", "selection", "estimators", "hidden_data", "next_experiment",
     "export", "recorded_systems", "transition", "casadi_jax", "exam",
 )  # fmt: skip
+LONG = frozenset((Path(__file__).parent / "long.txt").read_text().split())  # whole files, and functions of others
 RUNS_A_VERB = {"simpel", "start", "process", "subprocess"}  # names whose use makes a test more than a unit
 MOST_BYTES = 2e9  # of one worker, after which it forgets its programs
 
@@ -59,6 +60,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("unit")
         if "shared" in getattr(item, "fixturenames", ()):
             item.add_marker("needs_recordings")
+        if LONG & {(name := item.nodeid.split("[")[0]), name.split("::")[0]}:
+            item.add_marker("long")
     rank = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 

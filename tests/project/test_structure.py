@@ -62,6 +62,16 @@ def test_no_two_files_of_tests_have_one_name() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
+def test_long_tests_exist() -> None:
+    """Whoever renames one takes its line in tests/long.txt along."""
+    names = (ROOT / "tests" / "long.txt").read_text().split()
+    assert names == sorted(set(names))
+    for name in names:
+        file, *within = name.split("::")
+        text = (ROOT / file).read_text()
+        assert all(re.search(rf"^ *(class|def) {word}\b", text, re.MULTILINE) for word in within), name
+
+
 GUIDES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "explanation").glob("life_of_*.md"))]
 
 
