@@ -136,9 +136,10 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         study = open_study(declared, data_folder, whole=False)
     searched = _with_groups(study, _search(study, terminal), terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
-    base, per = selection.base, per_of(searched.groupings)
-    base = in_common(search, base, per) if per else base
-    before, after = (assessor(t.optimum.z, searched.windows) for t in (base, selection.chosen))
+    if per := per_of(searched.groupings):  # before is the simulator as it was declared
+        selection = selection._replace(base=in_common(search, selection.base, per))
+        searched = searched._replace(selection=selection)
+    before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
     found = _verdict(searched, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
     found["summary"] += sentence_of_latency(latencies)

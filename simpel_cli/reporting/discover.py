@@ -9,6 +9,7 @@ from simpel_cli.config.resolved import dump, load
 from simpel_cli.discovery.verdict.undetectable import in_words
 from simpel_cli.reporting.discover_sections import HORIZONS, reliable, rows_of, sections_of, untested, words
 from simpel_cli.reporting.figures.canvas import with_interval, with_unit
+from simpel_cli.reporting.figures.discover_runs import models_of
 from simpel_cli.reporting.html import write_report
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import typed
@@ -81,7 +82,7 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
 
 def _table(found: dict[str, Any], directory: Path) -> str:
     """Errors before and after, for terminals."""
-    both = bool(found["corrected_sim"])
+    both = "after" in models_of(found)
     cells = [["", "", "before", *(["after", "reduction (95 %)"] if both else []), "noise floor"]]
     for row in rows_of(read_columns(directory / "errors.parquet")):
         label = HORIZONS[row["horizon"]].format(steps=found["error"]["horizon_steps"])

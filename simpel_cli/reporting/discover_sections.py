@@ -12,6 +12,7 @@ from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
 from simpel_cli.discovery.verdict.remainder import dependence
 from simpel_cli.reporting.figures import draw_discover
 from simpel_cli.reporting.figures.canvas import with_interval, with_unit
+from simpel_cli.reporting.figures.discover_runs import models_of
 from simpel_cli.reporting.html import figure
 from simpel_cli.runs.files import read_columns
 
@@ -69,7 +70,7 @@ def rows_of(table: Table) -> list[dict[str, Any]]:
 def error_section(found: Mapping[str, Any], errors: Table) -> Section:
     """Errors on test episodes, before and after."""
     error = found["error"]
-    both = bool(found["effects"])
+    both = "after" in models_of(found)
     rows = []
     for row in rows_of(errors):
         label = HORIZONS[row["horizon"]].format(steps=error["horizon_steps"])
@@ -88,7 +89,7 @@ def error_section(found: Mapping[str, Any], errors: Table) -> Section:
     note = (
         f"Root mean square errors on {n} test episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
         + (
-            " (before), and of the same with the effects (after): the reduction is due to the effects alone. "
+            " (before), and of the same with what was found (after): the reduction is due to that alone. "
             if both
             else ". "
         )
@@ -112,9 +113,10 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
         return {}
     timing = _timing(before)
     lines = [[(text, False)] for text in [*(f"d({s})/dt = {e}" for s, e in old.items()), *timing]]
-    blocks = [{"title": "before" if found["effects"] else "as declared", "lines": lines}]
+    both = "after" in models_of(found)
+    blocks = [{"title": "before" if both else "as declared", "lines": lines}]
     text = ""
-    if after is not None and found["effects"]:
+    if after is not None and both:
         lines = [[(f"d({s})/dt = ", False), *marked(str(old.get(s, "")), str(e))] for s, e in new.items()]
         lines += [[(line, line not in timing)] for line in _timing(after)]
         blocks.append({"title": f"after ({after['name']})", "lines": lines})
@@ -123,7 +125,7 @@ def equation_section(found: Mapping[str, Any], before: Mapping[str, Any], after:
             text = (
                 f"Not in the corrected YAML: {'; '.join(words(name) for name in lacks)}. The errors above include it."
             )
-    title = "The equation before and after" if found["effects"] else "The equation"
+    title = "The equation before and after" if both else "The equation"
     return {"title": title, "equations": blocks, "after": text}
 
 
@@ -141,8 +143,11 @@ def _as_in(sim: Mapping[str, Any]) -> str:
 
 
 def _timing(sim: Mapping[str, Any]) -> list[str]:
-    """Describe inputs that act differently from their recorded values: changed, delayed or with a lag."""
+    """Describe parameters that differ, and inputs that act differently from their recorded values: changed or late."""
     lines = _timing(base) if isinstance(base := sim.get("base"), Mapping) else []
+    for name, node in (sim.get("parameters") or {}).items():
+        if isinstance(node, Mapping) and "per" in node:
+            lines.append(f"{name} has a value for every {node['per']}")
     for name, node in (sim.get("inputs") or {}).items():
         if "value" in node:
             lines.append(f"{name} acts as {node['value']}")
@@ -220,7 +225,7 @@ def effect_section(found: Mapping[str, Any]) -> Section:
 def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
     """Parameters before and after; where no effect was found, calibrated."""
     rows = []
-    models = ("before", "after") if found["effects"] else ("before",)
+    models = models_of(found)
     table = [row for row in rows_of(parameters) if row["model"] in models]
     for key in dict.fromkeys((r["parameter"], r["effect"]) for r in table):
         own = {r["model"]: r for r in table if (r["parameter"], r["effect"]) == key}
@@ -231,8 +236,8 @@ def parameter_section(found: Mapping[str, Any], parameters: Table) -> Section:
     if not rows:
         return {}
     return {
-        "title": "Parameters before and after" if found["effects"] else "Calibrated parameters",
-        "head": ["", *(models if found["effects"] else ("calibrated",)), "declared range"],
+        "title": "Parameters before and after" if len(models) > 1 else "Calibrated parameters",
+        "head": ["", *(models if len(models) > 1 else ("calibrated",)), "declared range"],
         "rows": rows,
         "note": "With 90 % intervals. A parameter whose interval fills its range is not determined by these data"
         + ("; one that changes a lot compensated for the missing effect." if found["effects"] else "."),

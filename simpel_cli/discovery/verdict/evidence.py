@@ -79,7 +79,7 @@ def evidence_tables(
     chosen, base = selection.chosen.optimum.z, selection.base.optimum.z
     off = search.off(chosen, selection.chosen.terms)
     vectors = {BEFORE: base}
-    if selection.chosen.terms:
+    if not np.array_equal(chosen, base):
         loud = [np.concatenate([z[: n_p + n_r], base[n_p + n_r :]]) for z in (off, chosen)]
         vectors |= {WITHOUT: loud[0], AFTER: loud[1]}
     splits: dict[str, tuple[Windows, Sequence[Episode]]] = {

@@ -245,6 +245,8 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
             return f"No known effect explains the model error: {found['remainder']['description']}."
         case _:
             text = "No missing effect was found: the calibrated simulator explains these data"
+            if not np.array_equal(first, second, equal_nan=True):
+                text = f"{text} where parameters differ. {gain.removesuffix('.')}"
             if found["process_noise"]["share_after"] < SHAKEN:
                 return f"{text}."
             return (

@@ -7,6 +7,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, TIE
 from simpel_cli.reporting.figures.canvas import BLACK, COLOURS, distinct, new_figure, with_interval
+from simpel_cli.reporting.figures.discover_runs import models_of
 from simpel_cli.runs.files import read_columns
 
 LOWEST = -12.0  # nats; candidates below are excluded, and their bars end at the edge
@@ -133,7 +134,7 @@ def _bracket(axis: Any, own: dict[str, np.ndarray], shown: list[int], accepted: 
 def draw_parameters(found: dict[str, Any], path: Path) -> Any:
     """Draw parameters with 90 % intervals, before and after, in their declared ranges."""
     table = read_columns(path)
-    if not found["effects"]:
+    if "after" not in models_of(found):
         table = {name: column[table["model"] == "before"] for name, column in table.items()}
     if not table or not len(table["parameter"]):
         return None

@@ -13,6 +13,7 @@ from simpel_cli.reporting.figures.canvas import (
     new_figure,
     with_unit,
 )
+from simpel_cli.reporting.figures.discover_runs import models_of
 from simpel_cli.runs.files import read_columns, read_units
 
 BINS = 14
@@ -55,8 +56,7 @@ def draw_residual(found: dict[str, Any], path: Path) -> Any:
     panels = _panels(table)
     figure, axes = new_figure(len(panels), 3.4, 2.9, columns=3)
     for axis, (acts_on, argument) in zip(axes, panels, strict=True):
-        models = ("before", "after") if found["effects"] else ("before",)
-        for model in models:
+        for model in models_of(found):
             own = (table["acts_on"] == acts_on) & (table["model"] == model)
             colour, label = STYLE[model]
             x, force = table[argument][own], table["force"][own]

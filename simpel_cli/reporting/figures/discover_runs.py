@@ -1,5 +1,6 @@
 """Figures of the simulator before and after: simulated episodes, whiteness of one-step errors, errors by horizon."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ STYLE = {"before": (COLOURS[1], "calibrated simulator", "--"), "after": (COLOURS
 HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
 
 
-def models_of(found: dict[str, Any]) -> tuple[str, ...]:
-    """Return the models worth drawing: where nothing was added, both are the same."""
-    return ("before", "after") if found["effects"] else ("before",)
+def models_of(found: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the models worth showing: where nothing was corrected, both are the same."""
+    return ("before", "after") if found["corrected_sim"] else ("before",)
 
 
 def draw_traces(found: dict[str, Any], path: Path) -> Any:
