@@ -49,8 +49,8 @@ def column_noise(config: Measurements, model: Source, mapping: Mapping, train: S
                 value = step * OF_STEP
                 told.steps[name] = step
             least = rounding(there) * OF_STEP
-            if np.isfinite(least):
-                told.least[name] = least
+            if np.isfinite(least) and np.isfinite(value):
+                told.least[name] = min(least, value)
         if np.isfinite(value):
             told.std[name] = float(value)
     return told

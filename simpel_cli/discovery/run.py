@@ -283,7 +283,9 @@ def _search(study: Study, terminal: Terminal, own: list[Grouping] | None = None)
         if settled or not selection.chosen.terms
         else own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
     )
-    if per_of(beside) != per_of(own):
+    if per_of(beside) == per_of(own):
+        own = beside  # what it is worth beside the effects
+    else:
         for one in beside:
             terminal.line(f"beside these effects {grouping_in_words(one)}", "groups")
         terminal.line("searching once more", "groups")

@@ -51,10 +51,7 @@ def test_gains_of_rigs_differ_and_nothing_is_missing(tmp_path: Path) -> None:
     (one,) = (g for g in verdict["grouping"] if g["pays"])
     assert (one["parameter"], one["per"], one["gate"]["passed"]) == ("b", "rig", True)
     assert f"Grouping b by rig pays (+{one['gain']:.0f} nats). b differs from rig to rig" in verdict["summary"]
-    assert (
-        "explains these data where parameters differ. The test error 20 rows ahead in"
-        in verdict["summary"]
-    )
+    assert "explains these data where parameters differ. The test error 20 rows ahead in" in verdict["summary"]
     assert verdict["process_noise"]["after"] < 0.1 * verdict["process_noise"]["before"]
     assert {*pq.read_table(tmp_path / "run/residuals.parquet")["model"].to_pylist()} == {"before", "without", "after"}
     truth = yaml.safe_load((tmp_path / "made/card.yaml").read_text())["truth_by_group"]["rig"]

@@ -86,11 +86,18 @@ def in_common(search: Search, base: Trial, per: Mapping[str, str]) -> Trial:
     rows = {q.name: i for i, q in enumerate(search.plan.augmented.params)}
     spreads = [rows[f"{name}_{SPREAD}"] for name in per]
     members = {i for row in spreads for i in search.own[row]}
-    z = search.loud(base.optimum.z)
-    z[spreads], z[list(members)] = 0.0, 0.5
+    starts = [search.loud(base.optimum.z), search.plan.start.copy()]
+    for z in starts:
+        z[spreads], z[list(members)] = 0.0, 0.5
     free = tuple(i for i in base.optimum.free if i not in members)
-    (alike,) = search.fitter([Hypothesis(z, free, search.ones)])
-    return Trial(base.terms, alike)
+    found = search.fitter([Hypothesis(z, free, search.ones) for z in starts])
+    return Trial(base.terms, max(found, key=lambda o: o.log_evidence))
+
+
+def declared_in(sim: dict[str, Any]) -> set[str]:
+    """Return the parameters with a range that a `sim:` node declares, or that on which it is built."""
+    own = {name for name, node in (sim.get("parameters") or {}).items() if isinstance(node, dict)}
+    return own | (declared_in(sim["base"]) if isinstance(sim.get("base"), dict) else set())
 
 
 def written(sim: dict[str, Any], per: Mapping[str, str]) -> dict[str, Any]:

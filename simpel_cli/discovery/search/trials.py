@@ -14,7 +14,7 @@ from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
-from simulators.groups import slot_names, spreads_of
+from simulators.groups import SPREAD, slot_names, spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -77,8 +77,11 @@ class Search:
         every = spreads_of(params)
         self.own = {row: rows for row, rows in every.items() if row not in alike}
         last = {rows[-1] + 1 for rows in every.values()}  # of what was never seen the data tell nothing
-        self.still = tuple(i for row in alike for i in (row, *every[row]))
-        self.always = tuple(i for i in range(len(params)) if i not in every and i not in {*last, *self.still})
+        self.still = (
+            *last,
+            *(i for row in alike for i in (row, *every[row])),
+        )  # unknowns that begin, and stay, as in `plan.start`
+        self.always = tuple(i for i in range(len(params)) if i not in every and i not in self.still)
         self.always += tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
@@ -323,9 +326,9 @@ def _slots(plan: Setup, own: dict[int, list[int]]) -> dict[int, int]:
         for g in term.groupings
         for q, slot in zip(g.members, g.slots, strict=True)
     }
-    per = list(model.base.per.values()) if model.base else []
-    for column, rows in zip(per, own.values(), strict=True):
-        found |= {
-            row: inputs.index(slot) for row, slot in zip(rows, slot_names(column, model.groups[column]), strict=False)
-        }
+    columns = {f"{name}_{SPREAD}": by for name, by in model.base.per.items()} if model.base else {}
+    for spread, rows in own.items():
+        by = columns[model.params[spread].name]
+        slots = slot_names(by, model.groups[by])[:-1]  # without the group that was never seen
+        found |= {row: inputs.index(slot) for row, slot in zip(rows, slots, strict=True)}
     return found

@@ -136,7 +136,7 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         for t, _ in others
     ]
     places = {m["name"]: m["acts_on"] for m in members[::-1]}
-    before = noise_of(search, selection.base)[1]
+    before = noise_of(search, selection.path[0])[1]  # with groups, where parameters differ
     after = noise_of(search, selection.chosen)[1]
     return {
         "name": term.effect,
