@@ -34,7 +34,7 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
-from simpel_cli.discovery.search.own_parameters import in_common, own_parameters, per_of, with_own, written
+from simpel_cli.discovery.search.own_parameters import declared_in, in_common, own_parameters, per_of, with_own, written
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
@@ -65,6 +65,7 @@ from simpel_cli.studies.open import Study, open_study, refuse_untested
 from simulators.effects import Expression
 from simulators.model import Model
 
+IN_PYTHON = "a simulator in Python, whose YAML does not name it: make it differ there"
 Publish = Callable[[Terminal, dict[str, Any], Path, dict[str, Any]], Any]  # terminal, verdict, directory, configuration
 
 
@@ -364,6 +365,9 @@ def _correct(
     config, model = declared.config, declared.source
     assert isinstance(model, Model)
     per = per_of(searched.groupings)
+    nowhere = [f"{name} per {by} ({IN_PYTHON})" for name, by in per.items() if name not in declared_in(config["sim"])]
+    if not found["effects"] and len(nowhere) == len(per):
+        return {"corrected_sim_lacks": nowhere}
     name, node, left_out = corrected(written(config["sim"], per), model, searched.search, searched.selection.chosen)
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
@@ -375,10 +379,10 @@ def _correct(
     after = declared.changed(sim=node)
     added: dict[str, Any] = {
         "corrected_sim": str(path.relative_to(directory)),
-        "corrected_sim_lacks": left_out,
+        "corrected_sim_lacks": [*left_out, *nowhere],
         "stack_actions": past_inputs(after.source),
     }
-    if config.get("close", True) and (per or len(left_out) < len(found["effects"])):
+    if config.get("close", True) and (len(nowhere) < len(per) or len(left_out) < len(found["effects"])):
         try:
             added["as_prior"] = close(declared, after, directory, data_folder, terminal)
         except DataError as error:  # a fit needs whole rows; what was found stands without it

@@ -9,6 +9,7 @@ export/posterior.json, posterior.safetensors, predictor.py      networks, see `s
 
 import json
 from pathlib import Path
+from typing import Any
 
 from simpel_cli.config.resolved import load, of_run
 from simpel_cli.errors import ConfigError
@@ -50,9 +51,9 @@ def export(run: Path, out: Path | None = None, seed: int | None = None) -> None:
     declared = declare(of_run(folder), only=("sim", "data", "method"))
     into = make_directory(out if out is not None else run / "export", "--out")
     terminal = Terminal(quiet=False)
-    declared, values, meaning = _as_found(run, declared, verb)
+    declared, values, groups, meaning = _as_found(run, declared, verb)
     if isinstance(declared.source, Model):
-        write_simulator(into, declared.source, declared.config["sim"], values)
+        write_simulator(into, declared.source, declared.config["sim"], values, groups)
         terminal.line(f"{into / 'simulator.casadi'}, .c, .h, .json, .yaml ({meaning})", "simulator")
     else:
         terminal.line("a world without equations: there is nothing to write for CasADi and C", "simulator")
@@ -61,10 +62,12 @@ def export(run: Path, out: Path | None = None, seed: int | None = None) -> None:
         terminal.line(f"{into / 'posterior.safetensors'}, .json, predictor.py (numpy only)", "posterior")
 
 
-def _as_found(run: Path, declared: Declared, verb: str) -> tuple[Declared, dict[str, float], str]:
-    """Return the configuration with the simulator that is written, values of its parameters, and what it is."""
+def _as_found(
+    run: Path, declared: Declared, verb: str
+) -> tuple[Declared, dict[str, float], dict[str, dict[str, Any]], str]:
+    """Return the configuration with the simulator that is written, values of its parameters, also by group, and what it is."""
     if verb != "discover":
-        return declared, {}, "as declared: its parameters are uncertain, values are the middle of their ranges"
+        return declared, {}, {}, "as declared: its parameters are uncertain, values are the middle of their ranges"
     try:
         verdict = json.loads((run / "verdict.json").read_text())
     except (OSError, ValueError) as error:
@@ -72,11 +75,22 @@ def _as_found(run: Path, declared: Declared, verb: str) -> tuple[Declared, dict[
     values = {name: own["after"]["value"] for name, own in (verdict.get("parameters") or {}).items()}
     for effect in verdict.get("effects") or []:
         values |= {name: own["value"] for name, own in (effect.get("parameters") or {}).items()}
+    groups = {
+        entry["parameter"]: {
+            "per": entry["per"],
+            "values": {name: own["value"] for name, own in entry["values"].items()},
+        }
+        for entry in verdict.get("groups") or []
+    }
+    differ = "".join(
+        f"; {name} has a value for every {own['per']}, here what they have in common" for name, own in groups.items()
+    )
     written = verdict.get("corrected_sim")
     if not written:
-        return declared, values, f"verdict `{verdict.get('verdict')}`: nothing was added; parameters as calibrated"
+        said = f"verdict `{verdict.get('verdict')}`: nothing was added; parameters as calibrated{differ}"
+        return declared, values, groups, said
     path = run / "conf" / "sim" / Path(written).name
-    return declared.changed(sim=load(path)), values, "corrected; parameters as identified"
+    return declared.changed(sim=load(path)), values, groups, f"corrected; parameters as identified{differ}"
 
 
 def _index(settings: Settings, seed: int | None) -> int:

@@ -14,7 +14,13 @@ from simpel_cli.runs.files import replacing, write_text
 from simulators.model import Model
 
 
-def write_simulator(into: Path, model: Model, sim: dict[str, Any], values: Mapping[str, float]) -> None:
+def write_simulator(
+    into: Path,
+    model: Model,
+    sim: dict[str, Any],
+    values: Mapping[str, float],
+    groups: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
     """Write one step of a simulator for CasADi and C, its names and units, and its YAML.
 
     Args:
@@ -22,12 +28,13 @@ def write_simulator(into: Path, model: Model, sim: dict[str, Any], values: Mappi
         model: the simulator.
         sim: its node, written as YAML.
         values: of parameters, where they are not the middle of their ranges.
+        groups: parameters that differ -> `per`, the column of their groups, and `values` by the name of the group.
     """
     from simulators.step import one_step
 
     step = one_step(model)
     write_text(into / "simulator.yaml", dump(sim))
-    write_text(into / "simulator.json", json.dumps(_facts(model, values), indent=1))
+    write_text(into / "simulator.json", json.dumps(_facts(model, values, groups or {}), indent=1))
     with replacing(into / "simulator.casadi") as temporary:
         step.save(str(temporary))
     with tempfile.TemporaryDirectory(dir=into, prefix=".c-") as name:
@@ -38,7 +45,7 @@ def write_simulator(into: Path, model: Model, sim: dict[str, Any], values: Mappi
             made.replace(into / made.name)
 
 
-def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
+def _facts(model: Model, values: Mapping[str, float], groups: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     def described(group: tuple[Any, ...]) -> list[dict[str, Any]]:
         return [
             {"name": q.name, "unit": q.unit, "angle": q.periodic, "low": _finite(q.low), "high": _finite(q.high)}
@@ -52,6 +59,7 @@ def _facts(model: Model, values: Mapping[str, float]) -> dict[str, Any]:
             "low": q.low,
             "high": q.high,
             "value": float(values.get(q.name, (q.low + q.high) / 2)),
+            **groups.get(q.name, {}),
         }
         for q in model.params
     ]

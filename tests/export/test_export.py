@@ -185,6 +185,7 @@ def test_the_simulator_that_discover_corrected(fitted: Path, tmp_path: Path) -> 
         "verdict": "effect", "corrected_sim": "conf/sim/cart_with_leak.yaml",
         "parameters": {"m": {"after": {"value": 1.21}}, "k": {"after": {"value": 19.5}}},
         "effects": [{"name": "leak", "parameters": {"b": {"value": 0.22}}}],
+        "groups": [{"parameter": "k", "per": "rig", "values": {"one": {"value": 18.0}, "two": {"value": 21.0}}}],
     }  # fmt: skip
     (run / "verdict.json").write_text(json.dumps(verdict))
     result = simpel(tmp_path, "export", run)
@@ -193,6 +194,11 @@ def test_the_simulator_that_discover_corrected(fitted: Path, tmp_path: Path) -> 
     facts = json.loads((run / "export" / "simulator.json").read_text())
     assert [(q["name"], q["value"]) for q in facts["p"]] == [("m", 1.21), ("k", 19.5), ("b", 0.22)]
     assert facts["name"] == "cart_with_leak"
+    assert [(q.get("per"), q.get("values")) for q in facts["p"][:2]] == [
+        (None, None),
+        ("rig", {"one": 18.0, "two": 21.0}),
+    ]
+    assert "k has a value for every rig, here what they have in common" in " ".join(result.out.split())
 
 
 @pytest.mark.parametrize(
