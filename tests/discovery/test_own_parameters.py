@@ -5,14 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
 from command_line import simpel
 from test_effects_by_group import CART, DATA
 
+from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.own_parameters import _can_differ, with_own, written
+from simpel_cli.discovery.search.smaller import small_search
 from simpel_cli.errors import ConfigError
+from simpel_cli.filtering.setup import setup
 from simpel_cli.studies.open import _grouped
 from simulators.groups import grouped
 from simulators.model import Declared
@@ -80,6 +84,36 @@ def test_a_force_of_every_rig_that_is_none_on_average(tmp_path: Path) -> None:
     (group,) = verdict["groups"]
     for name, own in group["values"].items():
         assert own["value"] == pytest.approx(truth[name]["f"], abs=0.02)
+
+
+def test_groups_of_two_columns_and_what_was_never_seen() -> None:
+    """Every group has the windows of its own column, in whatever order parameters came to differ; no data tell of `another`."""
+    model = Declared(
+        "m", dt=0.1, states={"x": {"unit": "m", "range": [-3, 3]}}, inputs={"u": {"range": [-2, 2], "between_rows": "held"}},
+        parameters={"a": {"range": [0.2, 2]}, "b": {"range": [-1, 2]}}, dynamics={"x": "b*u - a*x"},
+    ).model()  # fmt: skip
+    bare = grouped(model, {"rig": ("one", "two"), "day": ("mon", "tue", "wed")})
+    source = with_own(bare, {"b": "rig", "a": "day"})
+    random, episodes = np.random.default_rng(0), []
+    for k in range(6):
+        rig, day = np.eye(3)[k % 2], np.eye(4)[k % 3]
+        u = random.uniform(-2, 2, (25, 1))
+        x = [0.5]
+        for v in u[:-1, 0]:
+            x.append(0.9 * x[-1] + 0.1 * v)
+        states = np.array(x)[:, None] + 0.01 * random.standard_normal((25, 1))
+        inputs = np.hstack([u, np.tile(np.concatenate([rig, day]), (25, 1))])
+        episodes.append(Episode(f"e{k}", 0.1 * np.arange(25), states, inputs, np.empty((25, 0))))
+    recording = Recording(tuple(episodes), (), (), {"x": 0.01}, (), (), (), groups=dict(source.groups))
+    search = small_search(setup(source, recording, (), []), 2, 1)
+    names = [q.name for q in source.params]
+    slots = {names[row]: source.inputs[j].name for row, j in search.slot_of.items()}
+    assert slots == {
+        "a_of_mon": "day_is_mon", "a_of_tue": "day_is_tue", "a_of_wed": "day_is_wed",
+        "b_of_one": "rig_is_one", "b_of_two": "rig_is_two",
+    }  # fmt: skip
+    z = search.base().optimum.z
+    assert [z[names.index(f"{q}_of_another")] for q in "ab"] == [0.5, 0.5]  # the middle of the population
 
 
 def test_parameters_that_cannot_differ_are_not_asked_about() -> None:
