@@ -1,6 +1,7 @@
 """Whether parameters of the simulator differ from group to group, asked by a search itself, on planted groups."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.own_parameters import _can_differ, with_own, written
 from simpel_cli.discovery.search.smaller import small_search
 from simpel_cli.errors import ConfigError
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.setup import setup
 from simpel_cli.studies.open import _grouped
 from simulators.groups import grouped
@@ -112,8 +114,17 @@ def test_groups_of_two_columns_and_what_was_never_seen() -> None:
         "a_of_mon": "day_is_mon", "a_of_tue": "day_is_tue", "a_of_wed": "day_is_wed",
         "b_of_one": "rig_is_one", "b_of_two": "rig_is_two",
     }  # fmt: skip
-    z = search.base().optimum.z
-    assert [z[names.index(f"{q}_of_another")] for q in "ab"] == [0.5, 0.5]  # the middle of the population
+    fitter, begun = search.fitter, list[Hypothesis]()
+
+    def noted(hypotheses: Sequence[Hypothesis]) -> list[Optimum]:
+        begun.extend(hypotheses)
+        return fitter(hypotheses)
+
+    search.fitter = noted  # type: ignore[assignment]
+    search.base()
+    another = [names.index(f"{q}_of_another") for q in "ab"]
+    assert len(begun) > 4
+    assert all(list(h.z[another]) == [0.5, 0.5] for h in begun)  # the middle of the population
 
 
 def test_parameters_that_cannot_differ_are_not_asked_about() -> None:
