@@ -171,6 +171,22 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Return how long before its row each value was measured, (ny, ...); u: of a row, (nu, ...) or more; None: at it."""
         return u[nu + 1 :] if u.shape[0] > nu else None
 
+    def at_row(sensors: Callable[[Array], Any], before: Array, now: Array) -> Any:
+        """Return what sensors read with the input that acts from the row on; measured before it, with what acted until then.
+
+        So a transition reads them, and what is simulated: an output that has a held input follows it at once.
+        """
+        early = early_of(now)
+        if early is None:
+            return sensors(now)
+
+        def one(then: Array, at: Array) -> Array:
+            return jnp.where(
+                (early > 0).reshape(early.shape[:1] + (1,) * (at.ndim - early.ndim) + early.shape[1:]), then, at
+            )
+
+        return jax.tree.map(one, sensors(before), sensors(now))
+
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny), per_signal(p, sensor_lags, ny)
@@ -178,17 +194,19 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def seen(
         p: Array,
         x: Array,
-        u: Array,
+        inputs: tuple[Array, Array],
         rate: Array,
         rate_x: Array,
         jumps: Array,
-        early: Array | None,
         begin: tuple[Array, ...],
     ) -> tuple[Array, Array, Array]:
-        """Return what the sensors read, its derivative in the state, and the latter if no sensor were late."""
-        y, prompt = sensors(x, u, p)
+        """Return what the sensors read, its derivative in the state, and the latter if no sensor were late.
+
+        `inputs`: until the row, and from it on.
+        """
+        y, prompt = at_row(lambda u: sensors(x, u, p), *inputs)
         read, slope = y, prompt
-        if early is not None:
+        if (early := early_of(inputs[1])) is not None:
             read = read + jnp.sum(prompt * way_back(early, x, rate, begin), axis=1)
             slope = slope_back(early, prompt, rate_x)
         if late_ones:
@@ -228,8 +246,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             x, cov, u_before, rate, rate_x, jumps, begin = carry
             y_k, (ok_k, larger), u_k = data
             predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0])
-            # the sensor is read at the row: what arrived up to it is the last substep before
-            h_k, slope, prompt = seen(p, x, u_before, rate, rate_x, jumps, early_of(u_k[0, 0]), begin)
+            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), rate, rate_x, jumps, begin)
             if late_ones:
                 jumps = pushed(jumps, prompt, rate, rates(x, u_k[0, 0], p)[0])
             off = wrapped(y_k - h_k)
@@ -285,8 +302,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
             x, cov, u_before, rate, jumps, begin = carry
             y_k, (ok_k, larger), u_k, at_k, held_k = data
-            read, predicted, pace = moving_sensors(x, u_before, given), x, pace_of(u_k[0, 0])
-            if (early := early_of(u_k[0, 0])) is not None:
+            early, predicted, pace = early_of(u_k[0, 0]), x, pace_of(u_k[0, 0])
+            read = at_row(lambda u: moving_sensors(x, u, given), u_before, u_k[0, 0])
+            if early is not None:
                 read = read + jnp.sum(held_k.prompt * way_back(early, x, rate, begin), axis=1)
             if late_ones:
                 late = late_by(given.p)
@@ -352,7 +370,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array) -> Array:
         end = u_before[-1, -1]
-        now, slope = sensors(x, end, p)
+        now, slope = at_row(lambda u: sensors(x, u, p), end, u[0, 0])
         pace, early = pace_of(end), early_of(u[0, 0])
         if pace is None or early is None:
             return now
