@@ -77,10 +77,8 @@ class Search:
         every = spreads_of(params)
         self.own = {row: rows for row, rows in every.items() if row not in alike}
         last = {rows[-1] + 1 for rows in every.values()}  # of what was never seen the data tell nothing
-        self.still = (
-            *last,
-            *(i for row in alike for i in (row, *every[row])),
-        )  # unknowns that begin, and stay, as in `plan.start`
+        # unknowns that begin, and stay, as in `plan.start`
+        self.still = (*last, *(i for row in alike for i in (row, *every[row])))
         self.always = tuple(i for i in range(len(params)) if i not in every and i not in self.still)
         self.always += tuple(range(n_p, n_p + n_r + n_q))
         self.noise = tuple(range(n_p, n_p + n_r + n_q))
