@@ -110,7 +110,7 @@ class Predictive(NamedTuple):
 
     def _cdf(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
         z = self._standardised(y)
-        below = jax.scipy.stats.norm.cdf(z) if self.tail is None else student_t.cdf(z, self.tail[None, None])
+        below = jax.scipy.stats.norm.cdf(z) if self.tail is None else student_t.cdf_of_outputs(z, self.tail)
         return jnp.mean(below, axis=0)
 
     def pit(self, y: Float[Array, "n dy"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
@@ -168,7 +168,7 @@ class Predictive(NamedTuple):
                 near = jax.vmap(lambda a, t: jnp.interp(a, grid, t), in_axes=(2, 0), out_axes=2)(apart, table)
                 return jnp.mean(jnp.where(apart < grid[-1], near, apart), axis=0) * sigma
 
-            distance = student_t.expected_distance(self._standardised(y), self.tail[None, None])
+            distance = student_t.expected_distance(self._standardised(y), self.tail)
             to_data = jnp.mean(distance, axis=0) * sigma
         between = jnp.mean(jax.lax.map(spread, self.particles), axis=0)
         found = to_data - 0.5 * between
@@ -180,7 +180,7 @@ class Predictive(NamedTuple):
 
     def mahalanobis(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Squared Mahalanobis distance of y under the mixture's mean and covariance (chi-squared with dy if Gaussian)."""
-        return jnp.sum(self._white(y) ** 2, axis=-1)
+        return self._distance()(y)
 
     def _chi_squared_share(self, y: Float[Array, "n dy"]) -> Float[Array, " n"]:
         """Share of a chi-squared variable's mass below the Mahalanobis distance of y."""
@@ -198,29 +198,38 @@ class Predictive(NamedTuple):
     def _share_of(self, draws: int) -> Callable[[Float[Array, "n dy"]], Float[Array, " n"]]:
         key_particle, key_noise = jax.random.split(jax.random.key(0))
         _, n, dy = self.particles.shape
-        dtype = self.particles.dtype
+        dtype, distance = self.particles.dtype, self._distance()
         chosen = jax.random.randint(key_particle, (draws, n), 0, self.particles.shape[0], jnp.int32)
         centres = jnp.take_along_axis(self.particles, chosen[:, :, None], axis=0)
         if self.tail is None:
             noise = jax.random.normal(key_noise, (draws, n, dy), dtype)
         else:
-            noise = jax.random.t(key_noise, jnp.broadcast_to(1 / self.tail[None, None], (draws, n, dy)), dtype=dtype)
-        others = jax.lax.map(self.mahalanobis, centres + self._scales[None] * noise)
+            noise = student_t.draws(key_noise, (draws, n), self.tail.astype(dtype))
+        others = distance(centres + self._scales[None] * noise)
 
         def share(y: Float[Array, "n dy"]) -> Float[Array, " n"]:
-            nearer = jnp.sum((others < self.mahalanobis(y)[None]).astype(y.dtype), axis=0)
+            nearer = jnp.sum((others < distance(y)[None]).astype(y.dtype), axis=0)
             return (nearer + 0.5) / (draws + 1)
 
         return share
 
-    def _white(self, y: Float[Array, "n dy"]) -> Float[Array, "n dy"]:
-        """Return y about the mixture's mean, in units of its covariance."""
+    def _distance(self) -> Callable[[Float[Array, "*k n dy"]], Float[Array, "*k n"]]:
+        """Return squared distances from the mixture's mean, in units of its covariance; that is factored once."""
         centred = self.particles - self.mean[None]
         covariance = jnp.einsum("lni,lnj->nij", centred, centred) / self.particles.shape[0]
-        covariance = covariance + self._noise_variance[:, :, None] * jnp.eye(y.shape[1], dtype=y.dtype)[None]
+        covariance = (
+            covariance + self._noise_variance[:, :, None] * jnp.eye(centred.shape[2], dtype=centred.dtype)[None]
+        )
         factor = jnp.linalg.cholesky(covariance)
-        white = jax.scipy.linalg.solve_triangular(factor, (y - self.mean)[..., None], lower=True)
-        return white[..., 0]
+        eye = jnp.broadcast_to(jnp.eye(factor.shape[1], dtype=factor.dtype)[None], factor.shape)
+        root = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
+
+        def squared(y: Float[Array, "*k n dy"]) -> Float[Array, "*k n"]:
+            mean = self.mean.reshape((1,) * (y.ndim - 2) + self.mean.shape)
+            white = jnp.einsum("nij,...nj->...ni", root, y - mean)
+            return jnp.sum(white**2, axis=-1)
+
+        return squared
 
 
 def _mixture(log_densities: Float[Array, "L *n"]) -> Float[Array, "*n"]:

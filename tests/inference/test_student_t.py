@@ -29,12 +29,28 @@ def test_density_and_distribution_are_scipys(tail: float) -> None:
     np.testing.assert_allclose(student_t.cdf(jnp.asarray(z), at), stats.t.cdf(z, 1 / tail), rtol=1e-7, atol=1e-12)
 
 
+def test_the_table_of_the_distribution_is_scipys() -> None:
+    z = np.concatenate([np.linspace(-40, 40, 4001), [-1e7, -1e4, 1e4, 1e7]])
+    tails = np.asarray([0.01, *TAILS])
+    found = student_t.cdf_of_outputs(jnp.asarray(np.tile(z[:, None], (1, len(tails)))), jnp.asarray(tails))
+    for i, tail in enumerate(tails):
+        np.testing.assert_allclose(found[:, i], stats.t.cdf(z, 1 / tail), rtol=0, atol=1e-8)
+
+
+def test_draws_are_of_their_law() -> None:
+    tails = np.asarray([0.05, *TAILS])
+    drawn = np.asarray(student_t.draws(jax.random.key(0), (100, 200), jnp.asarray(tails)))
+    assert drawn.shape == (100, 200, len(tails))
+    for i, tail in enumerate(tails):
+        assert stats.kstest(drawn[..., i].ravel(), stats.t(1 / tail).cdf).pvalue > 1e-3
+
+
 @pytest.mark.parametrize("tail", TAILS)
 def test_expected_distances_are_integrals(tail: float) -> None:
     law = stats.t(1 / tail)
     for mu in (0.0, 0.8, 12.0):
         whole, _ = quad(lambda e, mu=mu: abs(mu + e) * law.pdf(e), -np.inf, np.inf, points=None, limit=200)
-        assert abs(float(student_t.expected_distance(jnp.asarray(mu), jnp.asarray(tail))) / whole - 1) < 1e-6
+        assert abs(float(student_t.expected_distance(jnp.asarray([mu]), jnp.asarray([tail]))[0]) / whole - 1) < 1e-6
     grid, table = student_t.distance_table(jnp.asarray([tail]))
     random = np.random.default_rng(0)
     apart = law.rvs(1_000_000, random_state=random) - law.rvs(1_000_000, random_state=random)
