@@ -15,21 +15,21 @@ def one_step(model: Model) -> casadi.Function:
     `x` are the states; `u` the inputs of this step and of the `model.past()` steps before it, oldest first, then the inputs of
     the next step that are linear between rows (`model.linear`), in one column; `p` the uncertain parameters. `next` are the
     states one `dt` later, integrated as a fit does (classical Runge-Kutta with `model.substeps`; an angle is not wrapped), `y`
-    the outputs now.
+    the outputs now, with the inputs that act from now on (a late one as it arrives).
 
     """
     du, past = len(model.inputs), model.past()
     x, p = (casadi.MX.sym(name, len(group), 1) for name, group in (("x", model.states), ("p", model.params)))
     u = casadi.MX.sym("u", du * (past + 1) + len(model.linear), 1)
-    now = u[du * past : du * (past + 1)]
-    y = model.function()(x, now, p)[1]
+    arriving = delayed_inputs(model, u, p)
+    y = model.function()(x, arriving[0].at(0.0), p)[1]
     names = ["x", "u", "p"], ["next", "y"]
     if not model.states:
         return casadi.Function(f"{model.name}_step", [x, u, p], [casadi.MX(0, 1), y], *names)
     flow, h = model.flow(), model.dt / model.substeps
     z = flow.enter(x, p) if flow.enter is not None else x
-    for arriving in delayed_inputs(model, u, p):
-        begin, middle, end = (arriving.at(share) for share in (0.0, 0.5, 1.0))
+    for piece in arriving:
+        begin, middle, end = (piece.at(share) for share in (0.0, 0.5, 1.0))
         k1 = flow.rhs(z, begin, p)
         k2 = flow.rhs(z + h / 2 * k1, middle, p)
         k3 = flow.rhs(z + h / 2 * k2, middle, p)

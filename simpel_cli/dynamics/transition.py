@@ -1,6 +1,8 @@
 """The one-step map of a simulator in the coordinates of the learning problem, for one point.
 
 (x, phi) -> y = [enc(F(s, u; phi)) - enc(s), g(s, u; phi)],   F = RK4 of the model over dt
+
+g reads the inputs that act from the row on: a late one as it arrives.
 """
 
 from collections.abc import Callable
@@ -12,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from simpel_cli.dynamics.arriving import arriving
 from simpel_cli.dynamics.casadi_jax import checked
 from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.dynamics.input_delay import delayed_inputs, prompt_inputs
+from simpel_cli.dynamics.input_delay import prompt_inputs
 from simpel_cli.dynamics.integrate import State, rk4_step
 from simpel_cli.errors import ConfigError
 from simulators.groups import slots_of
@@ -76,33 +79,19 @@ def transition(model: Model, encoding: Encoding) -> Transition:
             f"data.stack_actions: {encoding.stack}, but inputs of {model.name} act up to {model.memory():.3g} s later: a "
             f"transition needs the {needed} inputs before its own. Use data.stack_actions={needed}."
         )
-    params = [q.name for q in model.params]
-
-    def seconds(times: dict[str, float | str], phi: Float[Array, " dp"]) -> Float[Array, " du"]:
-        values = {**model.fixed, **{name: phi[i] for i, name in enumerate(params)}}
-        each = [times.get(q.name, 0.0) for q in model.inputs]
-        return jnp.stack([jnp.asarray(values[v] if isinstance(v, str) else v, phi.dtype) for v in each])
-
-    def follow(state: State, stacked: Float[Array, " su"], phi: Float[Array, " dp"]) -> State:
-        assert integrated is not None
-        u = encoding.input_rows(stacked)
-        if not (model.delay or model.lag):
-            return integrated(state, prompt_inputs(u[encoding.stack :], model.substeps, model.linear), phi)
-        late = delayed_inputs(
-            u, seconds(model.delay, phi), seconds(model.lag, phi), dt=model.dt, substeps=model.substeps, lead=encoding.stack,
-            linear=model.linear,
-        )  # fmt: skip
-        return integrated(state, late[0], phi)
+    late = bool(model.delay or model.lag)
 
     def step(x: Float[Array, " dx"], phi: Float[Array, " dp"]) -> Float[Array, " dy"]:
         state, stacked = encoding.split_x(x)
-        outputs = (
-            measure(state, encoding.inputs_now(stacked), phi)[1][jnp.array(rows, int)]
-            if measure is not None and rows
-            else state[:0]
-        )
-        after = follow(state, stacked, phi) if model.states else state
-        return encoding.to_y(state, after, outputs)
+        u = encoding.input_rows(stacked)
+        acting = arriving(model, u, phi, encoding.stack)[0] if late else None
+        now = encoding.inputs_now(stacked) if acting is None else acting[0, 0]
+        outputs = measure(state, now, phi)[1][jnp.array(rows, int)] if measure is not None and rows else state[:0]
+        if integrated is None:
+            return encoding.to_y(state, state, outputs)
+        if acting is None:
+            acting = prompt_inputs(u[encoding.stack :], model.substeps, model.linear)
+        return encoding.to_y(state, integrated(state, acting, phi), outputs)
 
     width = model.coordinates.size if model.coordinates is not None else len(model.states)
     return Transition(encoding, model.params, model.gap, step, width)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.dynamics.arriving import acting
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.even_rows import even_times, inputs_at, moved, uneven
 from simpel_cli.filtering.initial_states import begun
@@ -235,7 +236,8 @@ def _made(
         time = even
         inputs = inputs_at(episode.time, time, episode.inputs, model.linear)
         rates = partial(_rates, model, p)
-        there_then = found.smooth + moved(episode.time, time, found.smooth, episode.inputs, model.linear, rates)
+        felt = acting(model, np.nan_to_num(episode.inputs), p[: len(model.params)])
+        there_then = found.smooth + moved(episode.time, time, found.smooth, felt, model.linear, rates)
         read = _read(model, there_then, episode._replace(inputs=inputs), p, plan)
         shift = np.nan_to_num(np.concatenate([there_then, read], axis=1) - smoothed)
         at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
@@ -285,7 +287,8 @@ def _read(model: Model, states: np.ndarray, episode: Episode, p: np.ndarray, pla
     names = [q.name for q in model.outputs]
     columns = [names.index(name) for name in plan.augmented.measured if name in names]
     at = np.tile(p[: len(model.params), None], (1, len(states)))
-    read = np.asarray(model.function().map(len(states))(states.T, np.nan_to_num(episode.inputs).T, at)[1])
+    inputs = acting(model, np.nan_to_num(episode.inputs), p[: len(model.params)])
+    read = np.asarray(model.function().map(len(states))(states.T, inputs.T, at)[1])
     return read.T[:, columns]
 
 

@@ -64,9 +64,12 @@ class Inputs(NamedTuple):
         slope = np.where(goes, self.values[episode, following, signal] - value, 0.0) / np.where(goes, lasts, 1.0)
         return Course(value, slope, begin + late[:, None])
 
-    def at(self, t: np.ndarray, tie: float) -> np.ndarray:
-        """Return the inputs (n, m, du) as they are given at the times t (n, m), s; a row counts from `tie` s before it."""
-        return self.course(t + tie, np.zeros((len(t), self.values.shape[2]))).at(t)
+    def at(self, t: np.ndarray, tie: float, late: np.ndarray | None = None) -> np.ndarray:
+        """Return the inputs (n, m, du) at the times t (n, m), s, each `late` (n, du), s; a row counts from `tie` s before it.
+
+        None is late: the inputs as they are given.
+        """
+        return self.course(t + tie, np.zeros((len(t), self.values.shape[2])) if late is None else late).at(t)
 
 
 class Drifting(NamedTuple):
@@ -110,16 +113,34 @@ def true_values(
     else:
         states = of_rows(source, start, inputs.values, params.begin, times, cause)
     given = inputs.at(times, TIE * source.dt)
-    points = [each.reshape(times.size, each.shape[2]) for each in (states, given, params.at(times))]
+    arriving = given
+    if isinstance(source, Model) and source.delay:
+        arriving = inputs.at(times, TIE * source.dt, _delays(source, params.begin))
+    points = [each.reshape(times.size, each.shape[2]) for each in (states, given, params.at(times), arriving)]
     return {name: values.reshape(times.shape) for name, values in named(source, *points).items()}
 
 
-def named(source: Model | World, states: np.ndarray, inputs: np.ndarray, params: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the true values of states, inputs and outputs at n points, name -> (n,)."""
+def named(
+    source: Model | World,
+    states: np.ndarray,
+    inputs: np.ndarray,
+    params: np.ndarray,
+    arriving: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
+    """Return the true values of states, inputs and outputs at n points, name -> (n,).
+
+    Args:
+        source: the model or world.
+        states: (n, ds).
+        inputs: as given, (n, du).
+        params: (n, dp).
+        arriving: inputs as they act at these points, of which a model delays some, (n, du); None: none is late.
+
+    """
     found = {q.name: states[:, i] for i, q in enumerate(source.states)}
     found |= {q.name: inputs[:, i] for i, q in enumerate(source.inputs)}
     if isinstance(source, Model) and source.outputs:
-        outputs = RK4(source).measure(states, inputs, params)
+        outputs = RK4(source).measure(states, inputs if arriving is None else arriving, params)
         found |= {q.name: outputs[:, i] for i, q in enumerate(source.outputs)}
     return found
 
