@@ -86,31 +86,34 @@ def test_many_rows_at_one_end_settle() -> None:
     assert after[np.argmin(x)] > 2.4  # a row at which the prior is below the end is lifted to it
 
 
-def measured(seed: int, rows: int = 160) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def measured(seed: int, rows: int = 160, nu: float = np.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     u = rng.uniform(-2, 2, (rows, 1))
-    true = A * u + B + SIGMA * rng.normal(size=u.shape)
+    true = A * u + B + SIGMA * (rng.normal(size=u.shape) if np.isinf(nu) else rng.standard_t(nu, u.shape))
     y = np.clip(true, LOW, HIGH)
     return u, y, np.where(y == HIGH, 1.0, np.where(y == LOW, -1.0, 0.0))
 
 
-def training(seed: int, kind: str) -> Training:
-    u, y, beyond = measured(seed)
+def training(seed: int, kind: str, nu: float = np.inf) -> Training:
+    u, y, beyond = measured(seed, nu=nu)
     if kind == "clipped":
         return Training(u, y)
     return Training(u, y, np.ones_like(y), (beyond == 0).astype(float), beyond)
 
 
-def assembled(rows: list[Training], *, gap: bool) -> Assembled:
+def assembled(rows: list[Training], *, gap: bool, law: str = "gaussian") -> Assembled:
     return assemble(
         SYSTEM, NORMALISER, SimulatorPrior(gap=GapGP(scale=0.05) if gap else None), Gaussian(), rows, {"y": SIGMA}, {},
-        noise=NoiseModel(), pool=1, keys=list(jax.random.split(KEY, len(rows))), precision="float64", law="gaussian",
+        noise=NoiseModel(), pool=1, keys=list(jax.random.split(KEY, len(rows))), precision="float64", law=law,
     )  # fmt: skip
 
 
-def slope_and_offset(method: Any, kind: str, *, gap: bool, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def slope_and_offset(
+    method: Any, kind: str, *, gap: bool, steps: int, nu: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """Over eight sets of rows."""
-    made = assembled([training(seed, kind) for seed in range(8)], gap=gap)
+    law = "gaussian" if np.isinf(nu) else "student_t"
+    made = assembled([training(seed, kind, nu) for seed in range(8)], gap=gap, law=law)
 
     def fitted(problem: Problem) -> jax.Array:
         rule = method.bind(made.setting, problem)
@@ -138,6 +141,17 @@ def test_a_sensor_clipped_at_both_ends_does_not_flatten_the_line(method: Any, ga
     assert abs(a.mean() - A) < 4 * error
     assert abs(b.mean() - B) < 0.05
     assert clipped.mean() < A - 0.2
+
+
+def test_heavy_tails_at_the_ends_do_not_flatten_the_line() -> None:
+    a, b = slope_and_offset(SysID(starts=2), "marked", gap=False, steps=40, nu=3.0)
+    clipped, _ = slope_and_offset(SysID(starts=2), "clipped", gap=False, steps=40, nu=3.0)
+    print(
+        f"a = {a.mean():.3f} +- {a.std(ddof=1) / 8**0.5:.3f} ({A}), clipped {clipped.mean():.3f}, b = {b.mean():.3f} ({B})"
+    )
+    assert abs(a.mean() - A) < 0.05
+    assert abs(b.mean() - B) < 0.05
+    assert clipped.mean() < A - 0.1
 
 
 def test_shares_of_many_rows_have_sites_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
