@@ -11,8 +11,8 @@ and r = N(z)/Phi(z),
 
     t = m + s sqrt(sigma^2 + v)/(z + r),    w/sigma^2 = k/(1 - v k),    k = r (z + r)/(sigma^2 + v).
 
-The noise of the factor is Gaussian also where that of the values between the ends is Student's t, of its scale.Moments
-of a Student's t factor, as a mixture of Gaussians, were tried: of 40 lines with noise of 3 degrees of freedom and 30 % of the
+The noise of the factor is Gaussian also where that of the values between the ends is Student's t, of its scale. Moments of
+a Student's t factor, as a mixture of Gaussians, were tried: of 40 lines with noise of 3 degrees of freedom and 30 % of the
 rows at an end the mean slope was 1.945 +- 0.010, with the Gaussian factor 1.992 +- 0.009; truth 2.
 
 Reference: Rasmussen and Williams (2006), sec. 3.6, eqs. 3.58 (moments of a Gaussian times a probit) and 3.59 (sites); Tobin
