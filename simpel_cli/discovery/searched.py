@@ -1,0 +1,262 @@
+"""A whole search: in clean measurements, with the inputs between rows and the differences between groups that it finds."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from simpel_cli.data import Recording, read
+from simpel_cli.discovery.search.acceptance import accepted, with_interactions
+from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
+from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
+from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
+from simpel_cli.discovery.search.grouping import in_words as grouping_in_words
+from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
+from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
+from simpel_cli.discovery.search.own_parameters import own_parameters, per_of, with_own
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
+from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.dynamics.transition import encoding_of
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of
+from simpel_cli.inference.noise_scale import noise_scale_of
+from simpel_cli.runs.console import Terminal
+from simpel_cli.studies.declared import Declared
+from simpel_cli.studies.open import Study
+from simulators.effects import Expression
+from simulators.model import Model
+
+
+class Searched(NamedTuple):
+    """What a search came to, before it is put into words.
+
+    Args:
+        search: its fits.
+        assessor: of errors ahead.
+        selection: the models before and after.
+        gates: what every chosen effect adds on held-out episodes.
+        disturbance: a force that goes with time alone; None: there is none.
+        windows: held-out ones.
+        recording: the measurements that were searched in, with what was found in them.
+        between_rows: input -> what it does between rows, where neither simulator nor data say.
+        degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
+        groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
+    """
+
+    search: Search
+    assessor: Assessor
+    selection: Selection
+    gates: list[Gate]
+    disturbance: Disturbance | None
+    windows: Windows
+    recording: Recording
+    between_rows: dict[str, Preference]
+    degrees_of_freedom: dict[str, float]
+    groupings: list[Grouping]
+
+
+def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
+    """Estimate the latencies that the data give by a range, with the simulator as it is."""
+    model, measurements = study.system.source, study.measurements
+    ranges = measurements.latency_ranges()
+    if not ranges:
+        return {}
+    assert isinstance(model, Model)
+    options: Discovery = study.declared.groups.get("discovery") or Discovery()
+    names = [*(q.name for q in model.states), *study.recording.outputs]
+    columns = {name: names.index(name) for name in ranges}
+    longest = {name: high for name, (_, high) in ranges.items()}
+    known: list[tuple[Setup, Trial]] = []  # the best calibration so far: another latency moves it little
+
+    def evidence(at: Mapping[str, float]) -> float:
+        own = replace(measurements, latency=dict(measurements.latency) | dict(at))
+        recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
+        recording = _counted(same_readings(recording, columns, at, longest, model.dt), study)
+        plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
+        optimum = carried(known[-1][0], known[-1][1].optimum.z, plan) if known else None
+        base = small_search(plan._replace(optimum=optimum), options.lanes, 1).base()
+        if not known or base.optimum.log_evidence > known[-1][1].optimum.log_evidence:
+            known.append((plan, base))
+        return float(base.optimum.log_evidence)
+
+    found = estimated(evidence, ranges, model.dt)
+    terminal.line(in_words_of_latency(found), "latency")
+    return found
+
+
+def with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
+    """Return the configuration whose data say how late each reading is, so that whatever follows takes it so."""
+    data = declared.config["data"]
+    said = {name: round(each.value, 12) for name, each in found.items()}
+    return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
+
+
+def _counted(recording: Recording, study: Study, *, spikes: bool = False) -> Recording:
+    """Return measurements whose values count by the scale of their noise, where `data.noise.scale` says it."""
+    source, formulas = study.system.source, dict(study.measurements.noise_scale)
+    computed = set(recording.derived) - set(study.recording.estimated)
+    formulas = {name: formula for name, formula in formulas.items() if name not in computed}  # no channels
+    measured = [*recording.outputs, *(q.name for q in source.states)]
+    unmeasured = [q.name for q in source.outputs if q.name not in measured]
+    scale = noise_scale_of(formulas, encoding_of(source, recording.outputs), [*study.recording.estimated, *unmeasured])
+    return recording if scale is None else scale.counted(recording, spikes=spikes)
+
+
+def _alike(recording: Recording) -> Recording:
+    """Return measurements that all count alike."""
+    train, test = (tuple(e._replace(weight=None) for e in part) for part in (recording.train, recording.test))
+    return recording._replace(train=train, test=test)
+
+
+class _Ground(NamedTuple):
+    """What every search of a run shares.
+
+    Args:
+        model: the simulator as it was declared.
+        clean: measurements without what stands out.
+        options: of the search.
+        declared_noise: channels whose noise the user declared.
+        terminal: takes lines.
+    """
+
+    model: Model
+    clean: Cleaned
+    options: Discovery
+    declared_noise: tuple[str, ...]
+    terminal: Terminal
+
+    def attach(self, effects: list[Expression]) -> partial[Setup]:
+        """Return the function of a simulator that sets a search with these effects up."""
+        return partial(
+            setup, recording=self.clean.recording, declared_noise=self.declared_noise, effects=effects,
+            substeps=self.options.substeps, pairs=self.options.pairs, most_rows=self.options.rows,
+        )  # fmt: skip
+
+
+def search_of(study: Study, terminal: Terminal) -> Searched:
+    """Clean the measurements and search; once more with the effects that differ from group to group, as long as that pays."""
+    effects: list[Expression] = study.declared.groups["effect"]
+    ground = _ground(study, len(effects), terminal)
+    found = _search(ground, effects)
+    for _ in range(MOST_GROUPED):
+        grouped = grouped_effects(effects, found.groupings)
+        if grouped == effects:
+            break
+        effects = grouped
+        terminal.line("searching once more with it", "groups")
+        again = _search(ground, effects, [g for g in found.groupings if g.parameter])
+        if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
+            return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen))
+        before = confirmed(found.groupings, again.search, again.selection.chosen)
+        known = {(g.subject, g.per): g for g in (*before, *again.groupings)}
+        found = again._replace(groupings=list(known.values()))
+    return found
+
+
+def _ground(study: Study, effects: int, terminal: Terminal) -> _Ground:
+    """Clean the measurements; says what is searched in."""
+    model = study.system.source
+    assert isinstance(model, Model)
+    options: Discovery = study.declared.groups.get("discovery") or Discovery()
+    terminal.line(f"simpel discover · {model.name} · {effects} effects · {study.device}", style="bold")
+    declared_noise = tuple(study.measurements.noise_std)
+    clean = cleaned(_counted(study.recording, study, spikes=True), model, declared_noise)
+    # once more: what is typical is not what a lone value would make of it
+    clean = clean._replace(recording=_counted(_alike(clean.recording), study))
+    bad = [c for c in clean.recording.checks if not c.ok]
+    checks = len(clean.recording.checks)
+    terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{checks} ok", "data")
+    rows = sum(len(e.time) for e in clean.recording.train)
+    if rows > options.rows:
+        terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
+    return _Ground(model, clean, options, declared_noise, terminal)
+
+
+def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched:
+    """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
+
+    Args:
+        ground: what is searched in.
+        effects: that it may lack.
+        settled: which of the simulator's parameters differ from group to group; None: that is asked.
+    """
+    terminal = ground.terminal
+    own = settled
+    if own is None:
+        own = own_parameters(ground.attach(effects), ground.model, ground.options)
+        for one in own:
+            terminal.line(grouping_in_words(one), "groups")
+    while True:
+        found = _with(ground, effects, own, ask=settled is None)
+        if isinstance(found, Searched):
+            return found
+        settled = own = found
+        for one in own:
+            terminal.line(f"beside these effects {grouping_in_words(one)}", "groups")
+        terminal.line("searching once more", "groups")
+
+
+def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool) -> Searched | list[Grouping]:
+    """Search with the parameters of the simulator that differ from group to group.
+
+    Args:
+        ground: what is searched in.
+        effects: that it may lack.
+        own: which parameters differ.
+        ask: whether that is asked again beside the effects that were chosen; where others differ then, they are returned.
+    """
+    options, terminal, attach = ground.options, ground.terminal, ground.attach(effects)
+    declared = ground.model
+    model = with_own(declared, per_of(own)) if per_of(own) else declared
+    terms = terms_of(model, ground.clean.recording, effects, pairs=options.pairs)
+    plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
+
+    def searched_in(plan: Setup) -> tuple[Assessor, Calibrated, Selection, list[Gate]]:
+        fitter = fitter_of(plan, options.lanes, options.room + members(plan))
+        assessor = Assessor(plan, options.horizon)
+        found = calibrated(plan, fitter, assessor, ground.clean, terminal)
+        return assessor, found, *accepted(found.search, assessor, found.base, options, terminal)
+
+    assessor, found, selection, gates = searched_in(plan)
+    said, chosen = words_of(between_rows), selection.chosen
+    if said and chosen.terms:
+        between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
+    if words_of(between_rows) != said:
+        terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
+        plan = attach(saying(model, between_rows), kept=kept)
+        assessor, found, selection, gates = searched_in(plan)
+    if ask and selection.chosen.terms:
+        beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
+        if per_of(beside) != per_of(own):
+            return beside
+        own = beside  # what it is worth beside the effects
+    # beside what is left unexplained, no data tell whether tails are heavy
+    heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
+    if heavy is not None:
+        found = heavy
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    search, windows = found.search, found.test
+    outliers = outlier_check(found.clean, plan.augmented.measured)
+    terminal.line(outliers.detail, "outliers")
+    levels = NoiseProfile(search, assessor, selection.chosen)
+    attach_said = partial(attach, saying(model, between_rows))
+    selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
+    disturbance = None if selection.remainder else time_dependent_disturbance(levels)
+    if disturbance is not None:
+        terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
+    left = bool(selection.remainder or disturbance)
+    asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)
+    recording = ground.clean.recording
+    recording = recording._replace(checks=(*recording.checks, outliers))
+    return Searched(
+        search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
+        asked,
+    )  # fmt: skip
