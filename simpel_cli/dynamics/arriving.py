@@ -27,7 +27,11 @@ def arriving(
 
 
 def acting(model: Model, inputs: np.ndarray, phi: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return what acts from every row of an episode on, (T, du), where these are the inputs as given: what outputs read."""
+    """Return what acts from every row of an episode on, (T, du), where these are the inputs as given: what outputs read.
+
+    It is the mean over the first substep of the row, as everywhere in the tool: where a held input arrives within it, a share
+    of the new value is read already, and of a lag what it does in it.
+    """
     if not (model.delay or model.lag):
         return inputs
     past = model.past()

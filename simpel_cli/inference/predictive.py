@@ -226,7 +226,7 @@ class Predictive(NamedTuple):
 
         def squared(y: Float[Array, "*k n dy"]) -> Float[Array, "*k n"]:
             mean = self.mean.reshape((1,) * (y.ndim - 2) + self.mean.shape)
-            white = jnp.einsum("nij,...nj->...ni", root, y - mean)
+            white = jnp.einsum("nij,...nj->...ni", root, y - mean, precision=jax.lax.Precision.HIGHEST)
             return jnp.sum(white**2, axis=-1)
 
         return squared

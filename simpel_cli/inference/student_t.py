@@ -66,7 +66,7 @@ def cdf_of_outputs(z: Float[Array, "*n d"], tail: Float[Array, " d"]) -> Float[A
     (f, df), (g, dg) = ([jnp.take_along_axis(a, cell + k, axis=0) for a in (value, slope)] for k in (0, 1))
     w = place - cell.astype(place.dtype)
     found: Array = f + w * (df + w * (3 * (g - f) - 2 * df - dg + w * (df + dg - 2 * (g - f))))
-    return found.reshape(z.shape)
+    return jnp.clip(found, 0.0, 1.0).reshape(z.shape)
 
 
 def quantile(level: Float[Array, "*n"], tail: Float[Array, ""]) -> Float[Array, "*n"]:

@@ -210,6 +210,9 @@ class Simulate:
             )
             for name in getattr(source, "latency", {}):
                 raise ModelError(f"sim.outputs.{name}.delay: {why}; set it to 0, or {cure}")
+            late = {word: getattr(source, word, {}) for word in ("delay", "lag")} if not source.states else {}
+            for word, name in ((word, name) for word, names in late.items() for name in names):
+                raise ModelError(f"sim.inputs.{name}.{word}: {why}; leave it out, or {cure}")
             for key, given in ({k: getattr(self, k) for k in ("latency", "rates", "clocks")} | in_time).items():
                 if given:
                     raise ModelError(f"simulation.{key}: {why}; leave it out, or {cure}")

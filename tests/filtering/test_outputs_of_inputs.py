@@ -121,7 +121,7 @@ def test_the_filter_feels_a_late_input_when_it_arrives(word: str) -> None:
     )  # fmt: skip
     episode = Episode("e", times[0], true["v"].T, u, true["acc"].T)
     recording = Recording((episode,), (), ("acc",), {"v": 0.01, "acc": 0.05}, (), (), ())
-    plan = setup(model, recording, (), [])
+    plan = setup(model, recording, (), [], 4)  # an arrival at the end of a substep
     z = plan.start.copy()
     z[:3] = plan.coordinates.unit(np.arange(3), p)
     innovation = np.asarray(Tracks(plan).track(z, plan.windows).innovation)[0, model.past() + 1 :]

@@ -317,3 +317,13 @@ def test_a_function_as_a_world_is_late_by_whole_rows() -> None:
 def test_errors_name_the_key_and_the_cure(source: Any, how: dict[str, Any], fragment: str) -> None:
     with pytest.raises(ModelError, match=fragment):
         Simulate(**({"episodes": 2, "steps": 5} | how)).run(source())
+
+
+@pytest.mark.parametrize("late", [{"delay": 0.1}, {"lag": 0.1}])
+def test_rows_without_time_have_no_late_inputs(late: dict[str, float]) -> None:
+    model = Declared(
+        "line", dt=0.1, inputs={"u": {"unit": "V", "range": [-1, 1], **late}},
+        outputs={"y": {"unit": "V", "expression": "2*u"}},
+    ).model()  # fmt: skip
+    with pytest.raises(ModelError, match=rf"sim.inputs.u.{next(iter(late))}: line has no states"):
+        Simulate(episodes=1, steps=5).run(model)
