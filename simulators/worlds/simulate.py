@@ -210,8 +210,8 @@ class Simulate:
             )
             for name in getattr(source, "latency", {}):
                 raise ModelError(f"sim.outputs.{name}.delay: {why}; set it to 0, or {cure}")
-            late = {word: getattr(source, word, {}) for word in ("delay", "lag")} if not source.states else {}
-            for word, name in ((word, name) for word, names in late.items() for name in names):
+            words = () if source.states else ("delay", "lag")
+            for word, name in ((word, name) for word in words for name in getattr(source, word, {})):
                 raise ModelError(f"sim.inputs.{name}.{word}: {why}; leave it out, or {cure}")
             for key, given in ({k: getattr(self, k) for k in ("latency", "rates", "clocks")} | in_time).items():
                 if given:
