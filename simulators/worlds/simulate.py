@@ -210,9 +210,9 @@ class Simulate:
             )
             for name in getattr(source, "latency", {}):
                 raise ModelError(f"sim.outputs.{name}.delay: {why}; set it to 0, or {cure}")
-            words = () if source.states else ("delay", "lag")
-            for word, name in ((word, name) for word in words for name in getattr(source, word, {})):
-                raise ModelError(f"sim.inputs.{name}.{word}: {why}; leave it out, or {cure}")
+            for word in () if source.states else ("delay", "lag"):
+                for name in getattr(source, word, {}):
+                    raise ModelError(f"sim.inputs.{name}.{word}: {why}; leave it out, or {cure}")
             for key, given in ({k: getattr(self, k) for k in ("latency", "rates", "clocks")} | in_time).items():
                 if given:
                     raise ModelError(f"simulation.{key}: {why}; leave it out, or {cure}")
