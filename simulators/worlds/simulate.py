@@ -203,16 +203,13 @@ class Simulate:
         linear = [name for name, word in self.between_rows.items() if word == "linear"]
         in_time = {"jitter": self.jitter, "drift": self.drift, "between_rows": linear}
         if not source.states or self.layout == "transitions":
-            why, cure = (
-                ("rows of layout transitions do not follow each other in time", "take layout=trajectories")
-                if source.states
-                else (f"{source.name} has no states, so its rows have no time", "take a simulator with states")
-            )
-            for name in getattr(source, "latency", {}):
-                raise ModelError(f"sim.outputs.{name}.delay: {why}; set it to 0, or {cure}")
-            for word in () if source.states else ("delay", "lag"):
-                for name in getattr(source, word, {}):
-                    raise ModelError(f"sim.inputs.{name}.{word}: {why}; leave it out, or {cure}")
+            why, cure = "rows of layout transitions do not follow each other in time", "take layout=trajectories"
+            if not source.states:
+                why, cure = f"{source.name} has no states, so its rows have no time", "take a simulator with states"
+            late = [f"outputs.{name}.delay" for name in getattr(source, "latency", {})]
+            late += [f"inputs.{n}.{w}" for w in ("delay", "lag") if not source.states for n in getattr(source, w, {})]
+            for key in late:
+                raise ModelError(f"sim.{key}: {why}; set it to 0, or {cure}")
             for key, given in ({k: getattr(self, k) for k in ("latency", "rates", "clocks")} | in_time).items():
                 if given:
                     raise ModelError(f"simulation.{key}: {why}; leave it out, or {cure}")
