@@ -30,12 +30,25 @@ def searched(
         raise SystemExit(f"{directory} holds a verdict without its cost ({FILE}); remove it, or choose another --out")
     if not (directory / FILE).exists():
         command = [sys.executable, "-m", "simpel_cli.main", "discover", *words, f"hydra.run.dir='{directory}'"]
-        process = subprocess.Popen(
-            command, env=os.environ | dict(environment or {}), stdout=subprocess.DEVNULL, cwd=checkout
-        )
-        _, status, used = os.wait4(process.pid, 0)
-        if status:
+        cost = of_process(command, environment, checkout)
+        if cost is None:
             raise SystemExit(f"simpel discover {' '.join(words)} failed; what it said is in {directory}/run.log")
-        cost = {"cpu_seconds": used.ru_utime + used.ru_stime, "memory_mib": used.ru_maxrss / MIB}
         (directory / FILE).write_text(json.dumps(cost))
     return json.loads((directory / "verdict.json").read_text()) | {"cost": json.loads((directory / FILE).read_text())}
+
+
+def of_process(
+    command: Sequence[str], environment: Mapping[str, str] | None = None, folder: Path | None = None
+) -> dict[str, float] | None:
+    """Run a command and return what its process cost, `cpu_seconds` and `memory_mib`; None: it failed.
+
+    Args:
+        command: with its arguments.
+        environment: variables that are set.
+        folder: where it runs; None: where the caller is.
+    """
+    process = subprocess.Popen(command, env=os.environ | dict(environment or {}), stdout=subprocess.DEVNULL, cwd=folder)
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        return None
+    return {"cpu_seconds": used.ru_utime + used.ru_stime, "memory_mib": used.ru_maxrss / MIB}

@@ -5,15 +5,13 @@ and does not count. Prints medians, and the median of the ratios of neighbouring
 """
 
 import argparse
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from tests.benchmarks.cost import MIB
+from tests.benchmarks.cost import of_process
 
 HERE = Path(__file__).resolve().parents[2]
 HELD = "data.between_rows={u: held}"  # older versions take it so without being told
@@ -32,12 +30,10 @@ def cost(words: tuple[str, ...], version: Path, directory: Path) -> tuple[float,
     """
     command = [sys.executable, "-m", "simpel_cli.main", *words, f"hydra.run.dir='{directory}'"]
     began = time.perf_counter()
-    environment = os.environ | {"PYTHONPATH": str(version)}
-    process = subprocess.Popen(command, cwd=version, env=environment, stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    if status:
+    found = of_process(command, {"PYTHONPATH": str(version)}, version)
+    if found is None:
         raise SystemExit(f"simpel {' '.join(words)} failed in {version}")
-    return time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / MIB
+    return time.perf_counter() - began, found["cpu_seconds"], found["memory_mib"]
 
 
 def main() -> None:

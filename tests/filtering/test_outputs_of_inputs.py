@@ -58,6 +58,14 @@ def late_cart(word: str, lag: bool) -> Model:
     ).model()  # fmt: skip
 
 
+def truth(model: Model, p: np.ndarray, u: np.ndarray, word: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, speeds and accelerations of the rows, by the integrator that measurements are made with."""
+    times = 0.05 * np.arange(len(u))[None]
+    inputs = Inputs(times, u[None], np.array([word == "linear", False]))
+    true = true_values(model, np.array([[0.2]]), inputs, Drifting(p[None], np.zeros(3)), times, cause="a test")
+    return times[0], true["v"][0], true["acc"][0]
+
+
 LATE = [0.0, 0.05, 0.0625, 0.1, 0.1075]
 
 
@@ -67,15 +75,10 @@ def test_an_accelerometer_feels_a_late_input_when_it_arrives(word: str, late: fl
     model, n = late_cart(word, lag=False), 30
     p = np.array([0.7, 1.3, late])
     u = np.random.default_rng(0).uniform(-1, 1, (n, 2))
-    times = 0.05 * np.arange(n)[None]
-    true = true_values(
-        model, np.array([[0.2]]), Inputs(times, u[None], np.array([word == "linear", False])),
-        Drifting(p[None], np.zeros(3)), times, cause="a test",
-    )  # fmt: skip
-    v, acc = true["v"][0], true["acc"][0]
-    back = times[0] - late
+    times, v, acc = truth(model, p, u, word)
+    back = times - late
     held = u[np.maximum(np.floor(back / 0.05 + 1e-6).astype(int), 0), 0]
-    felt = np.interp(back, times[0], u[:, 0]) if word == "linear" else held
+    felt = np.interp(back, times, u[:, 0]) if word == "linear" else held
     np.testing.assert_allclose(acc, 1.3 * felt - 0.7 * v + u[:, 1], atol=1e-9)  # what simulate writes
     past = model.past()
     encoding, exported = encoding_of(model, ("acc",), past), one_step(model)
@@ -114,12 +117,8 @@ def test_a_lagged_input_is_felt_as_it_arrives() -> None:
 def test_the_filter_feels_a_late_input_when_it_arrives(word: str) -> None:
     model, p, n = late_cart(word, lag=False), np.array([0.7, 1.3, 0.0625]), 60
     u = np.random.default_rng(1).uniform(-1, 1, (n, 2))
-    times = 0.05 * np.arange(n)[None]
-    true = true_values(
-        model, np.array([[0.2]]), Inputs(times, u[None], np.array([word == "linear", False])),
-        Drifting(p[None], np.zeros(3)), times, cause="a test",
-    )  # fmt: skip
-    episode = Episode("e", times[0], true["v"].T, u, true["acc"].T)
+    times, v, acc = truth(model, p, u, word)
+    episode = Episode("e", times, v[:, None], u, acc[:, None])
     recording = Recording((episode,), (), ("acc",), {"v": 0.01, "acc": 0.05}, (), (), ())
     plan = setup(model, recording, (), [], 4)  # an arrival at the end of a substep
     z = plan.start.copy()
