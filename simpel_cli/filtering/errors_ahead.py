@@ -85,9 +85,14 @@ def rmse(error: np.ndarray) -> np.ndarray:
 
 
 def reduction_interval(
-    before: np.ndarray, after: np.ndarray, episode: np.ndarray, random: np.random.Generator, draws: int = 2000
+    before: np.ndarray,
+    after: np.ndarray,
+    episode: np.ndarray,
+    random: np.random.Generator,
+    draws: int = 4000,
+    level: float = 0.95,
 ) -> np.ndarray:
-    """Return 95 % intervals of RMSE before / RMSE after, (2, ny), by resampling whole episodes.
+    """Return intervals of RMSE before / RMSE after, (2, ny), by resampling whole episodes.
 
     Reference: Efron and Tibshirani (1993), An introduction to the bootstrap, ch. 8.
     """
@@ -99,7 +104,7 @@ def reduction_interval(
         ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
     measured = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
     interval = np.full((2, ratio.shape[1]), np.nan)
-    interval[:, measured] = np.nanquantile(ratio[:, measured], [0.025, 0.975], axis=0)
+    interval[:, measured] = np.nanquantile(ratio[:, measured], [(1 - level) / 2, (1 + level) / 2], axis=0)
     return interval
 
 

@@ -39,7 +39,7 @@ def gated_selection(
     the one with less evidence goes, and the other is judged without it.
 
     Returns:
-        what is left of the selection, its gates, and the terms with which the errors ahead grow.
+        what is left of the selection, its gates, and the terms with which an error grows.
     """
     harmful: list[int] = []
     while selection.chosen.terms:
@@ -90,7 +90,7 @@ def with_interactions(
 
 
 def _report_gate(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
-    why = "" if judged.passed else ", the errors ahead grow" if judged.harm else ", not certain"
+    why = "" if judged.passed else f", the error of {judged.grows[0]} grows" if judged.grows else ", not certain"
     terminal.line(
         f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
         f" by {judged.unit}{why}{': not accepted' if out else ''}",

@@ -13,8 +13,13 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor, gain_interva
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 
+AHEAD = {"one_step": "one row ahead", "ahead": "some rows ahead", "free": "in free run"}  # of an `Assessment`, in words
 MOST_FOLDS = 5
+TOLERATED = 0.02  # of an error: so much it may grow
+SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
 RUNAWAY = 1e4  # nats that a window costs a model that ran away in it
+
+Errors = Mapping[str, np.ndarray]  # by horizon, in words: (W, T, ny)
 
 
 class Gate(NamedTuple):
@@ -24,9 +29,10 @@ class Gate(NamedTuple):
         gain: nats, summed over all held-out parts.
         low, high: 95 % interval, by resampling episodes (or windows, where there are few episodes).
         unit: what was held out at a time.
-        harm: whether the errors some rows ahead grow, of every channel and certainly: a model that predicts the next row
-            better and all others worse has learnt to follow.
+        harm: whether an error grows: of any channel, at any horizon, certainly and by more than `TOLERATED`. A model that
+            predicts the next row better and all others worse has learnt to follow.
         passed: whether the lower end is positive and there is no harm.
+        grows: which errors grow, in words.
     """
 
     gain: float
@@ -35,6 +41,7 @@ class Gate(NamedTuple):
     unit: str
     harm: bool
     passed: bool
+    grows: tuple[str, ...] = ()
 
 
 def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
@@ -78,12 +85,18 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     if not scored:
         return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]
     named = np.concatenate([names for _, _, names, _, _ in scored])
-    likelihood, ahead = [], []
+    likelihood, errors = [], []
     for k in range(len(trials)):
         found_by = [(assessor(fits[k].z, part), part, out, price[k]) for part, out, _, fits, price in scored]
         likelihood.append(np.concatenate([(_likelihood(a, part) - price)[out] for a, part, out, price in found_by]))
-        ahead.append(np.concatenate([a.ahead[out] for a, _, out, _ in found_by]))
-    return [_judged(likelihood[0] - likelihood[k], ahead[k], ahead[0], named, unit) for k in range(1, len(trials))]
+        errors.append({
+            words: np.concatenate([getattr(a, name)[out] for a, _, out, _ in found_by]) for name, words in AHEAD.items()
+        })  # fmt: skip
+    measured = search.plan.augmented.measured
+    return [
+        _judged(likelihood[0] - likelihood[k], errors[k], errors[0], measured, named, unit)
+        for k in range(1, len(trials))
+    ]
 
 
 def _unseen(search: Search, free: Sequence[int], windows: Windows, kept: np.ndarray) -> dict[int, np.ndarray]:
@@ -126,15 +139,29 @@ def _batches(windows: Windows, size: int) -> Iterator[tuple[np.ndarray, Windows,
         yield rows[counts], Windows(*(a[rows % count] for a in windows)), counts
 
 
-def _judged(gains: np.ndarray, before: np.ndarray, after: np.ndarray, groups: np.ndarray, unit: str) -> Gate:
-    """Judge gains (W,) and errors ahead (W, T, ny) without and with an effect; groups: (W,)."""
+def _judged(
+    gains: np.ndarray, before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray, unit: str
+) -> Gate:
+    """Judge gains (W,) and errors without and with an effect; groups: (W,)."""
     per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
     low, high = gain_interval(per_group, np.random.default_rng(1))
-    harm = harmful(before, after, groups)
-    return Gate(float(gains.sum()), low, high, unit, harm, bool(low > 0) and not harm)
+    grows = growing(before, after, measured, groups)
+    return Gate(float(gains.sum()), low, high, unit, bool(grows), bool(low > 0) and not grows, grows)
 
 
-def harmful(before: np.ndarray, after: np.ndarray, groups: np.ndarray) -> bool:
-    """Whether the errors grow in every channel, with 97.5 % certainty; before, after: (W, T, ny), groups: (W,)."""
-    best = reduction_interval(before, after, groups, np.random.default_rng(1))[1]
-    return bool(np.isfinite(best).any() and np.all(best[np.isfinite(best)] < 1))
+def growing(before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray) -> tuple[str, ...]:
+    """Return which errors grow by more than is tolerated, certainly: of what, and how far ahead.
+
+    Args:
+        before: errors of every measured channel without an effect, at every horizon.
+        after: with it.
+        measured: names of the channels, ny.
+        groups: of which part each window is, (W,).
+    """
+    random = np.random.default_rng(1)
+    found = {}
+    told = sum(int(np.isfinite(e).any(axis=(0, 1)).sum()) for e in before.values())
+    for words, error in before.items():
+        best = reduction_interval(error, after[words], groups, random, level=1 - 2 * SURE / max(told, 1))[1]
+        found |= {f"{name} {words}": float(value) for name, value in zip(measured, best, strict=False)}
+    return tuple(words for words, best in found.items() if best < 1 / (1 + TOLERATED))

@@ -19,6 +19,7 @@ MOST_MERGERS = 2
 MOST_AGAIN = 3
 MOST_RUNNERS_UP = 8  # effects that a search could begin with
 BEGINNINGS = 2  # that it does begin with, beside the one that explains most
+MOST = 0.9  # of what a function without a name explains: a formula that explains so much of it stays
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
 
 
@@ -244,7 +245,7 @@ def _against(search: Search, found: Selection, without: Sequence[Trial], instead
             beaten = next((t for t in rivals if _nameless(search, t)), None)
             if instead is not None and chosen.terms[i] not in instead.terms:
                 beaten = instead
-            whole = None if beaten is None else _beside(search, chosen, i, beaten)
+            whole = None if beaten is None else _beside(search, chosen, i, beaten, rest)
             if whole is not None:
                 left[whole.terms[-1]] = whole.optimum.log_evidence - chosen.optimum.log_evidence
             elif beaten is not None:
@@ -266,11 +267,11 @@ def _asked_for(search: Search, chosen: Trial, functions: Collection[int]) -> dic
     return {t.terms[-1]: t.optimum.log_evidence - chosen.optimum.log_evidence for t in trials}
 
 
-def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None:
+def _beside(search: Search, chosen: Trial, i: int, rival: Trial, without: Trial) -> Trial | None:
     """Return the chosen model and a function without a name, unless that makes effect i superfluous.
 
-    A real friction is no formula: some function does better, and a formula may still be most of it. Where the program has no
-    room for both, the formula stays.
+    A real friction is no formula: some function does better, and a formula may still be most of it: where it earns beside the
+    function, or `MOST` of what the function earns in its place. Where the program has no room for both, the formula stays.
     """
     function, own = rival.terms[-1], chosen.terms[i]
     what, depends_on = search.terms[own].label, " and ".join(search.terms[function].depends_on)
@@ -288,8 +289,12 @@ def _beside(search: Search, chosen: Trial, i: int, rival: Trial) -> Trial | None
     rest = (*(t for t in chosen.terms if t != own), function)
     part = search.best(rest, search.fitter(search.less(whole, rest)))
     earned = whole.optimum.log_evidence - part.optimum.log_evidence
-    stays = earned >= asked(len(chosen.terms))
-    search.report(f"{what}: a function of {depends_on} does better{f', beside it +{earned:.0f}' if stays else ''}")
+    own_gain, its_gain = (t.optimum.log_evidence - without.optimum.log_evidence for t in (chosen, rival))
+    stays = earned >= asked(len(chosen.terms)) or own_gain >= MOST * its_gain
+    search.report(
+        f"{what} +{own_gain:.0f}: a function of {depends_on} does better, +{its_gain:.0f}"
+        f"{f'; beside it +{earned:.0f}' if stays else ''}"
+    )
     return whole if stays else None
 
 

@@ -61,6 +61,8 @@ class Search:
         report: takes a line.
         alike: spreads of parameters of the simulator whose groups have one value until a hypothesis frees them; `plan.start`
             has none for them.
+        silent: levels of noise that begin, and stay, as in `plan.start`.
+        weight: what every window counts.
     """
 
     def __init__(
@@ -69,6 +71,8 @@ class Search:
         fitter: Fitter | Spreading,
         report: Callable[[str], None] = lambda _: None,
         alike: Sequence[int] = (),
+        silent: Sequence[int] = (),
+        weight: float = 1.0,
     ) -> None:
         self.plan, self.report = plan, report
         self.terms = plan.augmented.terms
@@ -80,8 +84,8 @@ class Search:
         # unknowns that begin, and stay, as in `plan.start`
         self.still = (*last, *(i for row in alike for i in (row, *every[row])))
         self.always = tuple(i for i in range(len(params)) if i not in every and i not in self.still)
-        self.always += tuple(range(n_p, n_p + n_r + n_q))
-        self.noise = tuple(range(n_p, n_p + n_r + n_q))
+        self.noise = tuple(i for i in range(n_p, n_p + n_r + n_q) if i not in silent)
+        self.always += self.noise
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         differing = [plan.augmented.spreads(t) for t in self.terms]
         self.members = [tuple(i for own in each.values() for i in own[:-1]) for each in differing]
@@ -90,7 +94,8 @@ class Search:
         self.spreads_of = [tuple(each) for each in differing]
         inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
-        self.ones = np.ones(len(plan.windows.episode))
+        self.width = fitter.width - len(silent)  # every level of noise has its place in the program
+        self.ones = np.full(len(plan.windows.episode), weight)
         self.tried = 0
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
@@ -105,11 +110,11 @@ class Search:
 
     def fits(self, terms: Sequence[int]) -> bool:
         """Whether the compiled program has room for them."""
-        return len(self.free(terms)) <= self.fitter.width
+        return len(self.free(terms)) <= self.width
 
     def promises(self, before: Trial, starts: Sequence[tuple[int, Hypothesis]]) -> list[Score]:
         """Return what each start of each term promises beside a fitted set."""
-        return promises(self.plan, self.fitter, self.fitter.width, self.free(before.terms), before.optimum.z, starts)
+        return promises(self.plan, self.fitter, self.width, self.free(before.terms), before.optimum.z, starts, self.ones)
 
     def hypotheses(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Hypothesis]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""

@@ -128,6 +128,12 @@ class Fitter:
         other.windows, other._data = windows, tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
         return other
 
+    def within(self, coordinates: Coordinates) -> "Fitter":
+        """Return the same fitter with other bounds and priors of the same unknowns; it shares the compiled program."""
+        other = copy(self)
+        other.coordinates, other._bounds = coordinates, tuple(jnp.asarray(a) for a in coordinates.bounds)
+        return other
+
     def _begin(self, hypotheses: Sequence[Hypothesis]) -> Course:
         padding = len(self.coordinates.low) - 1
         noise = self._noise
