@@ -18,6 +18,9 @@ from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_t
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.own_parameters import declared_in, in_common, per_of, written
 from simpel_cli.discovery.searched import Searched, latencies_of, search_of, with_latencies
+from simpel_cli.discovery.verdict.beyond import Beyond, beyond
+from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges
+from simpel_cli.discovery.verdict.beyond import written as ranged
 from simpel_cli.discovery.verdict.corrected import corrected
 from simpel_cli.discovery.verdict.evidence import evidence_tables
 from simpel_cli.discovery.verdict.groups import sentence_of as of_groups
@@ -84,15 +87,16 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         selection = selection._replace(base=in_common(search, selection.base, per))
         searched = searched._replace(selection=selection)
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
-    found = _verdict(searched, before, after, began)
+    outside = beyond(study.system.source, search, selection.chosen, searched.wider)
+    found = _verdict(searched, outside, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
     found["summary"] += sentence_of_latency(latencies)
     if found["verdict"] == AMBIGUOUS:
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
     declared = _with_linear_inputs(declared, searched.between_rows)
-    if found["effects"] or per:
-        found |= _correct(declared, searched, found, directory, data_folder, terminal)
+    if found["effects"] or per or outside:
+        found |= _correct(declared, searched, outside, found, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
     shown = evidence_tables(search, selection, assessor, searched.recording, searched.windows, before, after)
     for name, table in shown.items():
@@ -101,9 +105,11 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     return found
 
 
-def _verdict(searched: Searched, before: Assessment, after: Assessment, began: float) -> dict[str, Any]:
+def _verdict(
+    searched: Searched, outside: list[Beyond], before: Assessment, after: Assessment, began: float
+) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
-    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked = searched
+    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked, _ = searched
     left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
     seconds = time.perf_counter() - began
     found = verdict_of(
@@ -113,14 +119,18 @@ def _verdict(searched: Searched, before: Assessment, after: Assessment, began: f
     found["degrees_of_freedom"] = nu
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
-    if per := per_of(asked):
-        found["steps"][0]["added"] = [f"{name} by {by}" for name, by in per.items()]
+    found["outside_ranges"] = [b._asdict() for b in outside]
+    first = [f"{name} by {by}" for name, by in per_of(asked).items()]
+    first += [f"{b.name} outside its range" for b in outside]
+    if first:
+        found["steps"][0]["added"] = first
         found["steps"].insert(0, {"added": [], "error": found["error"]["before"]})
     found["not_tested"] = undetectable(search, selection.chosen, recording.train)
     unknown = {(e["name"], e["acts_on"]) for e in found["not_tested"]}
     found["not_found"] = [e for e in found["not_found"] if (e["name"], e["acts_on"]) not in unknown]
     found["summary"] += (
-        of_grouping(asked)
+        of_ranges(outside)
+        + of_grouping(asked)
         + of_groups(found["groups"])
         + sentence_of(between_rows)
         + sentence_of_tails(nu)
@@ -143,6 +153,7 @@ def _with_linear_inputs(declared: Declared, found: dict[str, Preference]) -> Dec
 def _correct(
     declared: Declared,
     searched: Searched,
+    outside: list[Beyond],
     found: dict[str, Any],
     directory: Path,
     data_folder: Path,
@@ -153,9 +164,13 @@ def _correct(
     assert isinstance(model, Model)
     per = per_of(searched.groupings)
     nowhere = [f"{name} per {by} ({IN_PYTHON})" for name, by in per.items() if name not in declared_in(config["sim"])]
-    if not found["effects"] and len(nowhere) == len(per):
+    nowhere += [
+        f"the range of {b.name} ({IN_PYTHON})" for b in outside if b.name not in declared_in(config["sim"])
+    ]
+    changes = len(per) + len(outside)
+    if not found["effects"] and len(nowhere) == changes:
         return {"corrected_sim_lacks": nowhere}
-    name, node, left_out = corrected(written(config["sim"], per), model, searched.search, searched.selection.chosen)
+    name, node, left_out = corrected(ranged(written(config["sim"], per), outside), model, searched.search, searched.selection.chosen)
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
     for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
@@ -169,7 +184,7 @@ def _correct(
         "corrected_sim_lacks": [*left_out, *nowhere],
         "stack_actions": past_inputs(after.source),
     }
-    if config.get("close", True) and (len(nowhere) < len(per) or len(left_out) < len(found["effects"])):
+    if config.get("close", True) and (len(nowhere) < changes or len(left_out) < len(found["effects"])):
         try:
             added["as_prior"] = close(declared, after, directory, data_folder, terminal)
         except DataError as error:  # a fit needs whole rows; what was found stands without it

@@ -16,6 +16,8 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.own_parameters import own_parameters, per_of, with_own
+from simpel_cli.discovery.search.ranges import MOST_WIDER, too_narrow, widened, within
+from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
@@ -49,6 +51,7 @@ class Searched(NamedTuple):
         between_rows: input -> what it does between rows, where neither simulator nor data say.
         degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
         groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
+        wider: nats of evidence of ranges wider than those that were declared.
     """
 
     search: Search
@@ -61,6 +64,7 @@ class Searched(NamedTuple):
     between_rows: dict[str, Preference]
     degrees_of_freedom: dict[str, float]
     groupings: list[Grouping]
+    wider: float = 0.0
 
 
 def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
@@ -142,9 +146,27 @@ class _Ground(NamedTuple):
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
-    """Clean the measurements and search; once more with the effects that differ from group to group, as long as that pays."""
+    """Clean the measurements and search; once more with wider ranges, as long as a fit stands at the end of one and they pay."""
     effects: list[Expression] = study.declared.groups["effect"]
     ground = _ground(study, len(effects), terminal)
+    declared, gained = ground.model, 0.0
+    found = _search_in_groups(ground, effects)
+    for _ in range(MOST_WIDER):
+        wider, gain = too_narrow(found.search, found.selection)
+        if not wider:
+            break
+        terminal.line(ranges_in_words(wider, gain), "ranges")
+        gained += gain
+        model, effects = widened(ground.model, effects, wider)
+        ground = ground._replace(model=model)
+        found = _search_in_groups(ground, effects)
+    before = {q.name: (q.low, q.high) for q in declared.params}
+    base = within(found.search, found.selection.base, before)  # before: the simulator as it was declared
+    return found._replace(wider=gained, selection=found.selection._replace(base=base))
+
+
+def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched:
+    """Search; once more with the effects that differ from group to group, as long as that pays."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
         grouped = grouped_effects(effects, found.groupings)

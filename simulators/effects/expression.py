@@ -63,6 +63,7 @@ class Expression:
         units: unit or units of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
+        widened: unique name of a parameter at a place -> its range there, where a search found that stated too narrow.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Expression:
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
     per: str = ""
+    widened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         where = f"effect.{self.name}"
@@ -235,6 +237,7 @@ class Expression:
             if used is not None and label not in used:
                 continue
             low, high = (_value(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
+            low, high = self.widened.get(f"{prefix}_{label}", (low, high))
             null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
             given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
             starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)

@@ -12,6 +12,7 @@ from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
 
+STRONG = 20.0  # nats of evidence: an effect that earns so much may be uncertain on few held-out parts, if the set is not
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
 
@@ -36,7 +37,8 @@ def gated_selection(
     """Judge on held-out episodes what every effect adds to the others; of those that fail one goes at a time.
 
     Effects that are of use only together, as a delay and a slip, are judged together so. Of two that can stand for each other
-    the one with less evidence goes, and the other is judged without it.
+    the one with less evidence goes, and the other is judged without it. Few held-out parts cannot tell of every member of a
+    set whether it helps: one of strong evidence that helps there on the whole stays where the set certainly does.
 
     Returns:
         what is left of the selection, its gates, and the terms with which an error grows.
@@ -45,8 +47,10 @@ def gated_selection(
     while selection.chosen.terms:
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
-        judged = gates(search, assessor, chosen, parts)
+        *judged, whole = gates(search, assessor, chosen, [*parts, selection.base])
         failed = [i for i, found in enumerate(judged) if not found.passed]
+        if whole.passed and all(_helps(judged[i], selection.gains[i]) for i in failed):
+            failed = []
         gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
         for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
             _report_gate(search.terms[term].label, found, terminal, out=i == gone)
@@ -57,6 +61,11 @@ def gated_selection(
             search.banned.add(chosen.terms[gone])  # nor is it another name for what stays
         selection = refused(search, selection, gone)
     return selection, [], harmful
+
+
+def _helps(judged: Gate, earned: float) -> bool:
+    """Whether an effect that is not certain to help helps on the whole, with strong evidence and without harm."""
+    return not judged.harm and judged.gain > 0 and earned > STRONG
 
 
 def with_interactions(

@@ -12,7 +12,6 @@ Pauli, Racugno and Ventura (2011), Bayesian composite marginal likelihoods (the 
 import numpy as np
 
 from simpel_cli.discovery.search.selection import Selection, select
-from simpel_cli.discovery.search.spreads import Spreading
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.setup import Setup
@@ -82,7 +81,6 @@ def correlation_time(errors: np.ndarray) -> float:
 
 def _search(search: Search, plan: Setup, weight: float) -> Search:
     n_p, n_r, n_q = plan.coordinates.sizes
-    inner = search.fitter.fitter if isinstance(search.fitter, Spreading) else search.fitter
-    fitter = inner.within(plan.coordinates).on(plan.windows)
+    fitter = search.fitter.within(plan.coordinates).on(plan.windows)
     silent = range(n_p + n_r, n_p + n_r + n_q)
     return Search(plan, fitter, search.report, silent=silent, weight=weight)

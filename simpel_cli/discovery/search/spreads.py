@@ -61,7 +61,7 @@ class Spreading:
         found = self.fitter(hypotheses, most)
         if most < MOST:
             return found
-        moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight == 1) and self._here(found[i])]
+        moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight > 0) and self._here(found[i])]
         best = {i: self._paid(found[i]) for i in moving}
         for _ in range(ROUNDS):
             again = {}
@@ -80,6 +80,10 @@ class Spreading:
     def on(self, windows: Windows) -> "Spreading":
         """Return the same for other windows."""
         return Spreading(self.fitter.on(windows), self.spreads)
+
+    def within(self, coordinates: Coordinates) -> "Spreading":
+        """Return the same with other bounds and priors."""
+        return Spreading(self.fitter.within(coordinates), self.spreads)
 
     def _here(self, optimum: Optimum) -> list[int]:
         """Spreads of parameters that differ in this fit."""

@@ -1,0 +1,117 @@
+"""Ranges that turn out to be too narrow: of the simulator's parameters, and of effects.
+
+A range is what its author thought possible. Where a fit stands at an end of one, that end may be what keeps it from the truth,
+and effects are found that only make up for it: a heater weaker than its range allows looks like one that saturates. So the fit
+is made once more with wider ranges; since the prior spreads over more, evidence says whether it pays. What a sign or a
+conservation law forbids stays forbidden: no range is widened across zero.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.trials import ACCEPT, TIE, Search, Trial
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.setup import Setup
+from simulators.effects import Expression
+from simulators.groups import MEMBER, SPREAD
+from simulators.model import Model
+
+AT_END = 0.005  # of a range: a fit that ends so near to an end of it
+TIMES = 2.0  # spans by which a range becomes wider at that end
+NEAREST = 0.1  # of a bound that is not zero: as near to zero as a wider range comes
+MOST_WIDER = 3  # times that ranges become wider
+
+Range = tuple[float, float]
+
+
+def too_narrow(search: Search, selection: Selection) -> tuple[dict[str, Range], float]:
+    """Return wider ranges, by the names of their parameters, and what they gain, nats; none where they do not pay.
+
+    They do where the simulator alone gains with them what it gains with the best effect: that one may only make up for them,
+    and that a range is too narrow is the simpler cause. And they do where the chosen model gains with them.
+    """
+    plan, chosen, base = search.plan, selection.chosen, selection.base
+    first = max((t.optimum.log_evidence for s in selection.stages[:1] for t in s.trials), default=-np.inf)
+    for trial, least in ((base, first - base.optimum.log_evidence - TIE), (chosen, 0.0)):
+        wider = _wider(plan, trial)
+        if not wider:
+            continue
+        gain = _best(search, trial, wider) - trial.optimum.log_evidence
+        if gain > max(ACCEPT * len(wider), least):
+            return {plan.augmented.params[row].name: ends for row, ends in wider.items()}, float(gain)
+    return {}, 0.0
+
+
+def widened(model: Model, effects: Sequence[Expression], ranges: Mapping[str, Range]) -> tuple[Model, list[Expression]]:
+    """Return the simulator and the effects with wider ranges of the parameters that are named."""
+    own = {q.name for q in model.params}
+    params = tuple(q._replace(**dict(zip(("low", "high"), ranges.get(q.name, (q.low, q.high)), strict=True)))
+                   for q in model.params)  # fmt: skip
+    base = model.base and widened(model.base, [], ranges)[0]
+    rest = {name: ends for name, ends in ranges.items() if name not in own}
+    more = [replace(e, widened=dict(e.widened) | rest) for e in effects] if rest else list(effects)
+    return replace(model, params=params, base=base), more
+
+
+def within(search: Search, base: Trial, given: Mapping[str, Range]) -> Trial:
+    """Return a model fitted within narrower ranges, by the names of their parameters, in the coordinates of a search."""
+    plan = search.plan
+    declared = {row: given[q.name] for row, q in enumerate(plan.augmented.params)
+                if q.name in given and given[q.name] != (q.low, q.high)}  # fmt: skip
+    if not declared:
+        return base
+    narrow, z = _ranged(plan, base.optimum.z, declared)
+    found = _fitted(search, base, narrow, z)
+    best = max(found, key=lambda o: o.log_evidence)
+    back, again = best.z.copy(), plan.coordinates
+    for row in declared:
+        back[row] = again.unit(row, narrow.coordinates.value(row, float(best.z[row])))
+    return Trial(base.terms, best._replace(z=back))
+
+
+def in_words(ranges: Mapping[str, Range], gain: float) -> str:
+    """Return a line for the log."""
+    return f"{', '.join(ranges)} at the end of a range; wider +{gain:.0f} nats: searching once more"
+
+
+def _wider(plan: Setup, trial: Trial) -> dict[int, Range]:
+    """Return wider ranges of the unknowns of a model that stand at an end that may move."""
+    coordinates, found = plan.coordinates, dict[int, Range]()
+    for row in trial.optimum.free:
+        if row >= coordinates.sizes[0] or coordinates.log[row] or coordinates.normal[row]:
+            continue
+        q, at = plan.augmented.params[row], float(trial.optimum.z[row])
+        if q.role in (SPREAD, MEMBER):
+            continue
+        low, high = float(coordinates.low[row]), float(coordinates.high[row])
+        span = high - low
+        if at < AT_END and low != 0:
+            found[row] = (max(low - TIMES * span, NEAREST * low) if low > 0 else low - TIMES * span, high)
+        elif at > 1 - AT_END and high != 0:
+            found[row] = (low, min(high + TIMES * span, NEAREST * high) if high < 0 else high + TIMES * span)
+    return found
+
+
+def _ranged(plan: Setup, z: np.ndarray, ranges: Mapping[int, Range]) -> tuple[Setup, np.ndarray]:
+    """Return a setup with other ranges of some unknowns, and what z is in it."""
+    low, high = plan.coordinates.low.copy(), plan.coordinates.high.copy()
+    for row, ends in ranges.items():
+        low[row], high[row] = ends
+    coordinates = plan.coordinates._replace(low=low, high=high)
+    start, at = plan.start.copy(), z.copy()
+    for row in ranges:
+        start[row], at[row] = (coordinates.unit(row, plan.coordinates.value(row, float(v[row]))) for v in (start, z))
+    return plan._replace(coordinates=coordinates, start=start, optimum=None), at
+
+
+def _best(search: Search, trial: Trial, ranges: Mapping[int, Range]) -> float:
+    """Return the evidence of a model with other ranges."""
+    return max(o.log_evidence for o in _fitted(search, trial, *_ranged(search.plan, trial.optimum.z, ranges)))
+
+
+def _fitted(search: Search, trial: Trial, plan: Setup, z: np.ndarray) -> list[Optimum]:
+    starts = (z, search.loud(z))
+    return search.fitter.within(plan.coordinates)([Hypothesis(at, trial.optimum.free, search.ones) for at in starts])
