@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import importlib
 import inspect
+import keyword
 import re
 import types
 import typing
@@ -36,7 +37,7 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
     """
     if not isinstance(node, dict):
         raise ConfigError(f"{path}: got {node!r}; expected a mapping of keys.")
-    fields = {str(k): v for k, v in node.items() if k != "_target_"}
+    fields = {_field(str(k)): v for k, v in node.items() if k != "_target_"}
     target = node.get("_target_")
     cls = resolve(str(target), path, plugins) if target is not None else default or obvious_class(path)
     if cls is None:
@@ -55,7 +56,7 @@ def build(node: Any, path: str, plugins: tuple[str, ...] = (), *, default: type 
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in fields:
             raise ConfigError(f"{path}.{name}: missing. {_described(cls, name, hints)}")
-    values = {k: _convert(v, hints[k], f"{path}.{k}", plugins, cls) for k, v in fields.items()}
+    values = {k: _convert(v, hints[k], f"{path}.{k.removesuffix('_')}", plugins, cls) for k, v in fields.items()}
     try:
         return cls(**values)
     except ValueError as error:  # e.g. simulators.model.ModelError, which knows nothing of simpel_cli
@@ -174,6 +175,11 @@ def _function(name: str, path: str, plugins: tuple[str, ...]) -> Any:
     return found
 
 
+def _field(key: str) -> str:
+    """Return the field of a key: a word that Python keeps for itself has an underscore behind it there."""
+    return f"{key}_" if keyword.iskeyword(key) else key
+
+
 def _convert(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: type) -> Any:
     """Convert a YAML value to a field's type, or say what was expected."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) or _origin(hint) is typing.Union else (hint,)
@@ -184,7 +190,7 @@ def _convert(value: Any, hint: Any, path: str, plugins: tuple[str, ...], owner: 
         if converted is not _NO:
             return converted
     expected = " or ".join(_type_name(o) for o in options)
-    doc = field_docs(owner).get(path.rpartition(".")[2], "")
+    doc = field_docs(owner).get(_field(path.rpartition(".")[2]), "")
     raise ConfigError(f"{path}: got {value!r}; expected {expected}{': ' + doc if doc else '.'}")
 
 
@@ -247,13 +253,13 @@ def _described(cls: type, name: str, hints: dict[str, Any]) -> str:
 
 
 def _unknown_key(path: str, key: str, cls: type, hints: dict[str, Any]) -> str:
-    names = [f.name for f in dataclasses.fields(cls)]
+    names = [f.name.removesuffix("_") for f in dataclasses.fields(cls)]
     close = difflib.get_close_matches(key, names, n=1, cutoff=0.6)
     if not close:
         return f"{path}.{key}: no such key in {cls.__name__}. It has: {', '.join(names)}."
-    field = next(f for f in dataclasses.fields(cls) if f.name == close[0])
-    doc = field_docs(cls).get(close[0], "")
-    kind = getattr(hints[close[0]], "__name__", str(hints[close[0]]))
+    field = next(f for f in dataclasses.fields(cls) if f.name == _field(close[0]))
+    doc = field_docs(cls).get(field.name, "")
+    kind = getattr(hints[field.name], "__name__", str(hints[field.name]))
     value = f" = {field.default!r}" if field.default is not dataclasses.MISSING else ""
     return (
         f"{path}.{key}: no such key in {cls.__name__}. Did you mean {path}.{close[0]}?"

@@ -83,6 +83,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
         study = open_study(declared, data_folder, whole=False)
     searched = search_of(study, terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
+    assert isinstance(study.system.source, Model)
     if per := per_of(searched.groupings):  # before is the simulator as it was declared
         selection = selection._replace(base=in_common(search, selection.base, per))
         searched = searched._replace(selection=selection)

@@ -16,7 +16,7 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.own_parameters import own_parameters, per_of, with_own
-from simpel_cli.discovery.search.ranges import MOST_WIDER, too_narrow, widened, within
+from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
@@ -24,11 +24,13 @@ from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, test_windows
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.declared import Declared
@@ -129,6 +131,7 @@ class _Ground(NamedTuple):
         options: of the search.
         declared_noise: channels whose noise the user declared.
         terminal: takes lines.
+        wider: how often ranges of the model or of effects were found too narrow.
     """
 
     model: Model
@@ -136,6 +139,7 @@ class _Ground(NamedTuple):
     options: Discovery
     declared_noise: tuple[str, ...]
     terminal: Terminal
+    wider: int = 0
 
     def attach(self, effects: list[Expression]) -> partial[Setup]:
         """Return the function of a simulator that sets a search with these effects up."""
@@ -151,30 +155,50 @@ def search_of(study: Study, terminal: Terminal) -> Searched:
     ground = _ground(study, len(effects), terminal)
     declared, gained = ground.model, 0.0
     found = _search_in_groups(ground, effects)
-    for _ in range(MOST_WIDER):
-        wider, gain = too_narrow(found.search, found.selection)
-        if not wider:
-            break
-        terminal.line(ranges_in_words(wider, gain), "ranges")
-        gained += gain
-        model, effects = widened(ground.model, effects, wider)
-        ground = ground._replace(model=model)
+    while isinstance(found, Wider):
+        terminal.line(ranges_in_words(found), "ranges")
+        gained += found.gain
+        model, effects = widened(ground.model, effects, found.ranges)
+        ground = ground._replace(model=model, wider=ground.wider + 1)
         found = _search_in_groups(ground, effects)
     before = {q.name: (q.low, q.high) for q in declared.params}
     base = within(found.search, found.selection.base, before)  # before: the simulator as it was declared
-    return found._replace(wider=gained, selection=found.selection._replace(base=base))
+    selection = found.selection._replace(base=base)
+    return _for_use(ground, found._replace(wider=gained, selection=selection), terminal)
 
 
-def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched:
+def _for_use(ground: _Ground, found: Searched, terminal: Terminal) -> Searched:
+    """Calibrate the models before and after for what they will be used for (`discovery.for`)."""
+    use = ground.options.for_
+    if use in (None, ONE_STEP):
+        return found
+    search, assessor, selection = found.search, found.assessor, found.selection
+    plan, recording = search.plan, ground.clean.recording
+    whole = test_windows(plan, recording.train, recording.outputs) if use == FREE_RUN else plan.windows
+
+    def suited(trial: Trial) -> Trial:
+        windows = begun(assessor, trial.optimum.z, whole) if use == FREE_RUN else whole
+        return calibrated_for(search, assessor, trial, windows, use)
+
+    path = tuple(suited(t) for t in selection.path)
+    terminal.line(f"calibrated for {use if use == FREE_RUN else f'{use:g} s ahead'} (discovery.for)", "search")
+    return found._replace(selection=selection._replace(base=suited(selection.base), chosen=path[-1], path=path))
+
+
+def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched | Wider:
     """Search; once more with the effects that differ from group to group, as long as that pays."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
+        if isinstance(found, Wider):
+            return found
         grouped = grouped_effects(effects, found.groupings)
         if grouped == effects:
             break
         effects = grouped
-        terminal.line("searching once more with it", "groups")
+        ground.terminal.line("searching once more with it", "groups")
         again = _search(ground, effects, [g for g in found.groupings if g.parameter])
+        if isinstance(again, Wider):
+            return again
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
             return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen))
         before = confirmed(found.groupings, again.search, again.selection.chosen)
@@ -202,7 +226,7 @@ def _ground(study: Study, effects: int, terminal: Terminal) -> _Ground:
     return _Ground(model, clean, options, declared_noise, terminal)
 
 
-def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched:
+def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched | Wider:
     """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
 
     Args:
@@ -218,7 +242,7 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
             terminal.line(grouping_in_words(one), "groups")
     while True:
         found = _with(ground, effects, own, ask=settled is None)
-        if isinstance(found, Searched):
+        if isinstance(found, Searched | Wider):
             return found
         settled = own = found
         for one in own:
@@ -226,7 +250,7 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
         terminal.line("searching once more", "groups")
 
 
-def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool) -> Searched | list[Grouping]:
+def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool) -> Searched | Wider | list[Grouping]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:
@@ -234,6 +258,9 @@ def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, as
         effects: that it may lack.
         own: which parameters differ.
         ask: whether that is asked again beside the effects that were chosen; where others differ then, they are returned.
+
+    Returns:
+        the search; or what has to be known before it can be made: wider ranges, or parameters that differ.
     """
     options, terminal, attach = ground.options, ground.terminal, ground.attach(effects)
     declared = ground.model
@@ -241,20 +268,28 @@ def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, as
     terms = terms_of(model, ground.clean.recording, effects, pairs=options.pairs)
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
 
-    def searched_in(plan: Setup) -> tuple[Assessor, Calibrated, Selection, list[Gate]]:
+    def wider(found: Calibrated, trial: Trial) -> Wider | None:
+        return too_narrow(found.search, trial) if ground.wider < MOST_WIDER else None
+
+    def begun_in(plan: Setup) -> tuple[Assessor, Calibrated]:
         fitter = fitter_of(plan, options.lanes, options.room + members(plan))
         assessor = Assessor(plan, options.horizon)
-        found = calibrated(plan, fitter, assessor, ground.clean, terminal)
-        return assessor, found, *accepted(found.search, assessor, found.base, options, terminal)
+        return assessor, calibrated(plan, fitter, assessor, ground.clean, terminal)
 
-    assessor, found, selection, gates = searched_in(plan)
+    assessor, found = begun_in(plan)
+    if (ends := wider(found, found.base)) is not None:
+        return ends
+    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms:
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
     if words_of(between_rows) != said:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
-        assessor, found, selection, gates = searched_in(plan)
+        assessor, found = begun_in(plan)
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    if (ends := wider(found, selection.chosen)) is not None:
+        return ends
     if ask and selection.chosen.terms:
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):

@@ -68,6 +68,19 @@ class Assessor:
         e[:, :SETTLE] = np.nan
         return Assessment(e, s, horizon, wrap, log_likelihood, free, track)
 
+    def free_runs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
+        """Return the errors of free runs of several models at once, (models, W, T, ny), as `free` of an assessment.
+
+        Args:
+            z: (models, n) unit coordinates.
+            windows: of any shape.
+        """
+        bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
+        free = np.asarray(_free_program(self.plan.rule, self.plan.coordinates.layout)(bounds, jnp.asarray(z), *windows.arrays))
+        error = self._wrapped(windows.y - free) * np.where(windows.ok > 0, 1.0, np.nan)
+        error[:, :, :SETTLE] = np.nan
+        return error
+
     def track(self, z: np.ndarray, windows: Windows) -> Track:
         """Return the filter's track alone."""
         return self(z, windows).track
@@ -128,6 +141,14 @@ def results(assessment: Assessment, measured: tuple[str, ...], rows: float) -> d
 @lru_cache(maxsize=MOST_KEPT)
 def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Any:
     return jax.jit(jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0)))
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _free_program(rule: Filter, layout: tuple[Any, ...]) -> Any:
+    # what is not returned is not computed
+    one = lambda *given: _window(rule, layout, 1, *given)[2]  # noqa: E731
+    per_window = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, 0))
+    return jax.jit(jax.vmap(per_window, in_axes=(None, 0, *[None] * 5)))
 
 
 def _window(

@@ -63,6 +63,7 @@ class Expression:
         units: unit or units of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
+        mutual: what it adds to the rate of `x` it takes from that of `other`: one term per pair of states.
         widened: unique name of a parameter at a place -> its range there, where a search found that stated too narrow.
     """
 
@@ -77,6 +78,7 @@ class Expression:
     same_as: tuple[str, ...] = ()
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
+    mutual: bool = False
     per: str = ""
     widened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -103,6 +105,8 @@ class Expression:
             raise ModelError(
                 f"{where}.term: {self.term!r} has both `other` and `around`; one effect is an exchange with one"
             )
+        if self.mutual and not (isinstance(self.term, str) and self.term and "other" in _names(self.term)):
+            raise ModelError(f"{where}.mutual: its term has no `other`, from whose rate it could be taken")
         if not isinstance(self.per, str) or not (self.per.isidentifier() or not self.per):
             raise ModelError(f"{where}.per: {self.per!r} is not the name of a column (letters, digits, underscores)")
         if self.per and self.operator:
@@ -181,6 +185,8 @@ class Expression:
         role = next((r for r in ("other", "around") if r in names), "")
         among = {"other": states, "around": [q.name for q in model.inputs]}.get(role, [])
         others = [n for n in among if n != name and units[n] == units[name]] if role else [""]
+        if self.mutual:  # once per pair
+            others = [n for n in others if states.index(n) > states.index(name)]
         own = {"v": name, "x": name, "u": name, "y": name} | ({"s": position} if position else {})
         size = scales.size
         values = {
@@ -198,7 +204,11 @@ class Expression:
             parameters = self._parameters(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
             swap = own | {role: other} | {k.label: k.name for k in parameters}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
-            found.append(self._term(name, kind, text, parameters, model))
+            if self.mutual:
+                both = ((name, text), (other, f"-({text})"))
+                found.append(self._term(f"{name}, {other}", kind, "", parameters, model, both))
+            else:
+                found.append(self._term(name, kind, text, parameters, model))
         return found
 
     def _on_vehicle(self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales) -> list[Term]:

@@ -122,8 +122,9 @@ def _of_blocks(
     windows = search.plan.windows
     blocks = _blocks(windows)
     fold = np.random.default_rng(0).permutation(len(blocks)) % MOST_FOLDS
-    likelihood = [np.zeros(len(blocks)) for _ in trials]
-    errors = [{words: np.full((len(blocks), *windows.y.shape[1:]), np.nan) for words in AHEAD.values()} for _ in trials]
+    likelihood: list[np.ndarray] = [np.zeros(len(blocks)) for _ in trials]
+    shape = len(blocks), *windows.y.shape[1:]
+    errors: list[Errors] = [{words: np.full(shape, np.nan) for words in AHEAD.values()} for _ in trials]
     for k in range(MOST_FOLDS):
         out = blocks[fold == k].any(axis=0)
         fitter = search.fitter.on(windows._replace(ok=np.where(out[..., None], 0.0, windows.ok)))
@@ -232,7 +233,7 @@ def growing(before: Errors, after: Errors, measured: Sequence[str], groups: np.n
         groups: of which part each window is, (W,).
     """
     random = np.random.default_rng(1)
-    found = {}
+    found: dict[str, float] = {}
     told = sum(int(np.isfinite(e).any(axis=(0, 1)).sum()) for e in before.values())
     for words, error in before.items():
         best = reduction_interval(error, after[words], groups, random, level=1 - 2 * SURE / max(told, 1))[1]

@@ -8,10 +8,10 @@ conservation law forbids stays forbidden: no range is widened across zero.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import ACCEPT, TIE, Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
@@ -27,29 +27,41 @@ MOST_WIDER = 3  # times that ranges become wider
 Range = tuple[float, float]
 
 
-def too_narrow(search: Search, selection: Selection) -> tuple[dict[str, Range], float]:
-    """Return wider ranges, by the names of their parameters, and what they gain, nats; none where they do not pay.
+class Wider(NamedTuple):
+    """Ranges that pay.
 
-    They do where the simulator alone gains with them what it gains with the best effect: that one may only make up for them,
-    and that a range is too narrow is the simpler cause. And they do where the chosen model gains with them.
+    Args:
+        ranges: by the names of their parameters.
+        gain: nats of evidence.
     """
-    plan, chosen, base = search.plan, selection.chosen, selection.base
-    first = max((t.optimum.log_evidence for s in selection.stages[:1] for t in s.trials), default=-np.inf)
-    for trial, least in ((base, first - base.optimum.log_evidence - TIE), (chosen, 0.0)):
-        wider = _wider(plan, trial)
-        if not wider:
-            continue
-        gain = _best(search, trial, wider) - trial.optimum.log_evidence
-        if gain > max(ACCEPT * len(wider), least):
-            return {plan.augmented.params[row].name: ends for row, ends in wider.items()}, float(gain)
-    return {}, 0.0
+
+    ranges: dict[str, Range]
+    gain: float
+
+
+def too_narrow(search: Search, trial: Trial) -> Wider | None:
+    """Return the wider ranges with which a model gains; None: there are none.
+
+    The simulator alone has to gain with them what it gains with the best effect: that one may only make up for them, and that
+    a range is too narrow is the simpler cause.
+    """
+    wider = _wider(search.plan, trial)
+    if not wider:
+        return None
+    gain = _best(search, trial, wider) - trial.optimum.log_evidence
+    least = ACCEPT * len(wider)
+    if gain > least and not trial.terms:
+        trials = search.add(trial, search.candidates(())).trials
+        least = max([least, *(t.optimum.log_evidence - trial.optimum.log_evidence - TIE for t in trials[:1])])
+    names = [q.name for q in search.plan.augmented.params]
+    return Wider({names[row]: ends for row, ends in wider.items()}, float(gain)) if gain > least else None
 
 
 def widened(model: Model, effects: Sequence[Expression], ranges: Mapping[str, Range]) -> tuple[Model, list[Expression]]:
     """Return the simulator and the effects with wider ranges of the parameters that are named."""
     own = {q.name for q in model.params}
-    params = tuple(q._replace(**dict(zip(("low", "high"), ranges.get(q.name, (q.low, q.high)), strict=True)))
-                   for q in model.params)  # fmt: skip
+    ends = {q.name: ranges.get(q.name, (q.low, q.high)) for q in model.params}
+    params = tuple(q._replace(low=ends[q.name][0], high=ends[q.name][1]) for q in model.params)
     base = model.base and widened(model.base, [], ranges)[0]
     rest = {name: ends for name, ends in ranges.items() if name not in own}
     more = [replace(e, widened=dict(e.widened) | rest) for e in effects] if rest else list(effects)
@@ -72,9 +84,9 @@ def within(search: Search, base: Trial, given: Mapping[str, Range]) -> Trial:
     return Trial(base.terms, best._replace(z=back))
 
 
-def in_words(ranges: Mapping[str, Range], gain: float) -> str:
+def in_words(found: Wider) -> str:
     """Return a line for the log."""
-    return f"{', '.join(ranges)} at the end of a range; wider +{gain:.0f} nats: searching once more"
+    return f"{', '.join(found.ranges)} at the end of a range; with a wider one +{found.gain:.0f}: searching there"
 
 
 def _wider(plan: Setup, trial: Trial) -> dict[int, Range]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from simpel_cli.discovery.search.selection import BEGINNINGS
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP
 from simpel_cli.errors import ConfigError, check_at_least_one
 
 PAIR = 11  # unknowns of a function of two arguments beside an effect
@@ -21,6 +22,8 @@ class Discovery:
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.
             Without it, they are looked for in what is left at the end.
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
+        for_: what the model is for: `free_run`, how many seconds ahead (0.5), or `one_step`. The last calibration, of the
+            simulator and of the corrected one, is for it; null: one_step.
     """
 
     horizon: int = 20
@@ -30,6 +33,7 @@ class Discovery:
     rows: int = 3000
     pairs: bool = False
     beginnings: int = BEGINNINGS
+    for_: str | float | None = None
 
     def __post_init__(self) -> None:
         if self.pairs and self.room < PAIR:
@@ -37,6 +41,12 @@ class Discovery:
                 f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
             )
         check_at_least_one("discovery", self, ("horizon", "lanes", "room", "rows"))
+        if isinstance(self.for_, str) and self.for_ not in (ONE_STEP, FREE_RUN):
+            raise ConfigError(
+                f"discovery.for: got {self.for_!r}; allowed are {FREE_RUN}, {ONE_STEP}, or how many seconds ahead, e.g. 0.5."
+            )
+        if isinstance(self.for_, float) and not self.for_ > 0:
+            raise ConfigError(f"discovery.for: got {self.for_}; seconds ahead must be above 0.")
         if self.beginnings < 0:
             raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")
         if self.substeps is not None and self.substeps < 1:

@@ -54,7 +54,7 @@ def without_process_noise(plan: Setup, z: np.ndarray) -> Setup:
     r, q = np.arange(n_p, n_p + n_r), np.arange(n_p + n_r, n_p + n_r + n_q)
     high, normal, low = (getattr(plan.coordinates, name).copy() for name in ("high", "normal", "low"))
     size = [plan.scales.size[name] for name in plan.augmented.measured]
-    low[r] = np.log([plan.coordinates.value(i, 0.0 if not normal[i] else 0.25) for i in r])
+    low[r] = np.log([plan.coordinates.value(int(i), 0.25 if normal[i] else 0.0) for i in r])
     high[r] = np.maximum(np.log(LARGEST * np.array(size)), low[r] + 1)
     normal[r] = False
     coordinates = plan.coordinates._replace(low=low, high=high, normal=normal)

@@ -5,7 +5,7 @@ effects.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,6 +99,7 @@ class Search:
         self.tried = 0
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
+        self.asked: dict[tuple[Any, ...], Stage] = {}  # what was added to what already
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
         """Unknowns that move when these terms are there."""
@@ -207,6 +208,12 @@ class Search:
             candidates: terms.
             least: nats that a start must promise to be fitted.
         """
+        name = before.terms, before.optimum.z.tobytes(), tuple(candidates), least
+        if name not in self.asked:
+            self.asked[name] = self._added(before, candidates, least)
+        return self.asked[name]
+
+    def _added(self, before: Trial, candidates: Sequence[int], least: float) -> Stage:
         self.tried += len(candidates)
         starts = self.starts(before, candidates)
         scores = self.promises(before, starts)
@@ -244,7 +251,7 @@ class Search:
         own = self.terms[best.terms[-1]]
         for other in named[1:]:
             term = self.terms[other.terms[-1]]
-            simpler = term.effect in own.generalises and term.acts_on == own.acts_on
+            simpler = term.effect in own.generalises and own.acts_on in (term.acts_on, *term.acts_on.split(", "))
             value = other.optimum.log_evidence
             if simpler and value > least and best.optimum.log_evidence - value < ACCEPT:
                 best, own = other, term

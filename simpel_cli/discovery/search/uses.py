@@ -1,0 +1,97 @@
+"""The last calibration: of the chosen model, for what it will be used for.
+
+The innovations say which physics; a model that is still wrong somewhere has parameters that predict the next row best, and
+others that simulate best. So with the effects settled the parameters are fitted once more, to the errors so far ahead as the
+model will be used,
+
+    1/2 sum_k e_k^2 / (sigma^2 tau) + 6 |z - z_0|^2,
+
+sigma and tau the size and the integrated autocorrelation time of the errors before. The second term is the variance of a
+uniform prior, about where the innovations put it: what these errors do not tell stays there.
+
+Reference: Ljung (1999), System identification, 7.2 (output error); Nocedal and Wright (2006), Numerical optimization, 10.3.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from simpel_cli.discovery.search.simulation import correlation_time
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
+from simpel_cli.filtering.measurements.windows import Windows
+
+ONE_STEP, FREE_RUN = "one_step", "free_run"
+NUDGE = 1e-4  # of a range, for differences
+LOST = 1e3  # standard deviations that an error counts where a model runs away
+MOST = 30  # evaluations
+
+Errors = Callable[[np.ndarray], np.ndarray]  # (models, n) -> (models, W, T, ny)
+
+
+def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Windows, use: str | float) -> Trial:
+    """Return a model with the parameters that suit a use.
+
+    Args:
+        search: that it comes from.
+        assessor: of its program.
+        trial: the model as the innovations calibrated it.
+        windows: of all training rows, as long as they are for a free run.
+        use: ONE_STEP, FREE_RUN, or how far ahead, s.
+    """
+    rows = [i for i in trial.optimum.free if i not in search.noise]
+    if use == ONE_STEP or not rows:
+        return trial
+    errors = _errors_of(assessor, windows, use, search.plan.augmented.model.dt)
+    z = trial.optimum.z
+    before = errors(z[None])[0]
+    tau = correlation_time(before)
+    sigma = np.sqrt(np.nanmean(before.reshape(-1, before.shape[-1]) ** 2, axis=0))
+    there = np.isfinite(windows.y) & (windows.ok > 0) & np.isfinite(before) & (sigma > 0)
+    if not there.any():
+        return trial
+
+    def residual(at: np.ndarray) -> np.ndarray:
+        """Return what is squared, (models, residuals); at: (models, unknowns)."""
+        moved = np.repeat(z[None], len(at), axis=0)
+        moved[:, rows] = at
+        e = (errors(moved) / (sigma * np.sqrt(tau)))[:, there]
+        e = np.where(np.isfinite(e), np.clip(e, -LOST, LOST), LOST)
+        return np.concatenate([e, np.sqrt(LEAST_CURVATURE) * (at - z[rows])], axis=1)
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        step = np.where(at > 0.5, -NUDGE, NUDGE)
+        both = residual(np.concatenate([at[None], at + np.diag(step)]))
+        return ((both[1:] - both[0]) / step[:, None]).T
+
+    begin = np.clip(z[rows], NUDGE, 1 - NUDGE)
+    def one(at: np.ndarray) -> np.ndarray:
+        return residual(at[None])[0]
+
+    found: Any = least_squares(one, begin, slope, bounds=(0.0, 1.0), max_nfev=MOST)
+    if not found.cost < 0.5 * float(np.sum(residual(z[rows][None]) ** 2)):
+        return trial
+    moved = z.copy()
+    moved[rows] = found.x
+    return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
+
+
+def _placed(trial: Trial, rows: list[int], z: np.ndarray, covariance: np.ndarray) -> Any:
+    """Return an optimum that lies elsewhere, as certain as the errors so far ahead make it."""
+    optimum = trial.optimum
+    at = [optimum.free.index(i) for i in rows]
+    centre, wide = optimum.centre.copy(), optimum.covariance.copy()
+    centre[at] = z[rows]
+    wide[at, :], wide[:, at] = 0.0, 0.0
+    wide[np.ix_(at, at)] = covariance
+    return optimum._replace(z=z, centre=centre, covariance=wide)
+
+
+def _errors_of(assessor: Assessor, windows: Windows, use: str | float, dt: float) -> Errors:
+    if use == FREE_RUN:
+        return lambda z: assessor.free_runs(z, windows)
+    ahead = Assessor(assessor.plan, max(1, round(float(use) / dt)))
+    return lambda z: np.stack([ahead(one, windows).ahead for one in z])
