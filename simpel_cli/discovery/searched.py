@@ -24,12 +24,12 @@ from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for
+from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
-from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.measurements.windows import Windows, thinned
 from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, test_windows
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
@@ -174,11 +174,10 @@ def _for_use(ground: _Ground, found: Searched, terminal: Terminal) -> Searched:
         return found
     search, assessor, selection = found.search, found.assessor, found.selection
     plan, recording = search.plan, ground.clean.recording
-    whole = test_windows(plan, recording.train, recording.outputs) if use == FREE_RUN else plan.windows
+    whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
 
     def suited(trial: Trial) -> Trial:
-        windows = begun(assessor, trial.optimum.z, whole) if use == FREE_RUN else whole
-        return calibrated_for(search, assessor, trial, windows, use)
+        return calibrated_for(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
     path = tuple(suited(t) for t in selection.path)
     terminal.line(f"calibrated for {use if use == FREE_RUN else f'{use:g} s ahead'} (discovery.for)", "search")

@@ -7,12 +7,25 @@ from typing import Any
 import numpy as np
 import pytest
 from test_aliases import searched
+from test_ranges import cart
+from test_ranges import searched as measured_search
 
-from simpel_cli.discovery.search.held_out_gate import RUNAWAY, gates, growing
+from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.search.held_out_gate import (
+    LEAST_BLOCKS,
+    LEAST_OF_BLOCK,
+    RUNAWAY,
+    _blocks,
+    _judged,
+    _tempered,
+    gates,
+    growing,
+)
 from simpel_cli.discovery.search.trials import Trial
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
+from simulators.effects import Expression
 
 
 @pytest.mark.parametrize(
@@ -137,3 +150,51 @@ def test_a_single_window_cannot_be_held_out() -> None:
     trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(2)]
     (judged,) = gates(search, Likelihoods(), trials[0], trials[1:])
     assert not judged.passed
+
+
+def test_blocks_of_a_short_record_cover_it_once() -> None:
+    windows = windows_of([0] * 3, 0)
+    ok = np.ones((3, 40, 1))
+    ok[2, 30:] = 0.0  # the last window is shorter
+    blocks = _blocks(windows._replace(ok=ok))
+    np.testing.assert_array_equal(np.sum(blocks, axis=0), ok[..., 0])
+    assert min(b.sum() for b in blocks) >= LEAST_OF_BLOCK
+    assert all(len(set(np.argwhere(b)[:, 0])) == 1 for b in blocks)
+    many = _blocks(windows._replace(ok=np.ones((3, 200, 1))))
+    assert LEAST_BLOCKS <= len(many) <= LEAST_BLOCKS + 3
+
+
+def test_one_odd_block_decides_nothing_of_the_likelihood() -> None:
+    random = np.random.default_rng(0)
+    gains = random.uniform(2, 6, 20)
+    errors = {"in free run": random.normal(size=(20, 9, 1))}
+    odd = gains.copy()
+    odd[0] = -300.0
+    judged = [_judged(_tempered(g), errors, errors, ("y",), np.arange(20), "block") for g in (gains, odd, -odd)]
+    assert [j.passed for j in judged] == [True, True, False]
+    grown = {"in free run": 2 * errors["in free run"]}
+    assert _judged(_tempered(gains), errors, grown, ("y",), np.arange(20), "block").grows == ("y in free run",)
+
+
+def test_a_short_record_is_judged_on_blocks_that_lie_between_others() -> None:
+    """A load of 0.5 m/s^2 that acts in the last quarter alone: no fit without that quarter knows of it."""
+    load = Expression("load", acts_on="v", term="c*(u > 2)", parameters={"c": {"range": [-2, 2], "unit": "1/T^2"}})
+    random = np.random.default_rng(1)
+    x, u = np.zeros((160, 2)), np.zeros((160, 1))
+    u[120:] = 3.0
+    u[:120, 0] = np.repeat(random.uniform(-2, 2, 24), 5)
+    for i in range(159):
+        a = u[i, 0] + 0.5 * (u[i, 0] > 2)
+        x[i + 1] = x[i, 0] + 0.1 * x[i, 1] + 0.005 * a, x[i, 1] + 0.1 * a
+    x += 1e-3 * random.normal(size=x.shape)
+    episode = Episode("0", np.arange(160) * 0.1, x, u, np.zeros((160, 0)))
+    recording = Recording((episode,), (episode,), (), {"s": 1e-3, "v": 1e-3}, (), (), ())
+    search = measured_search(recording, [load], cart(0.5, 1.5))
+    base = search.base()
+    trial = next(t for t in search.add(base, [0]).trials)
+    (judged,) = gates(search, Assessor(search.plan, 5), trial, [base])
+    assert judged.unit == "block"
+    assert judged.passed
+    (other,) = gates(search, Assessor(search.plan, 5), base, [trial])
+    assert not other.passed
+    assert other.harm

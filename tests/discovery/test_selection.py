@@ -244,6 +244,8 @@ def test_a_delay_of_several_rows_is_fitted_whatever_its_slope_at_none_says() -> 
     [
         ("A", False, "B", ""), ("B", False, "A", ""), ("B", True, "A", "B"), ("", False, "AB", ""), ("AB", False, "", ""),
         ("one of two", False, "A", ""),  # each can stand for the other: the one with less evidence goes
+        ("A alone", False, "AB", ""),  # both together certainly help, and A has strong evidence
+        ("A alone", True, "B", "A"),
     ],
 )  # fmt: skip
 def test_what_the_gate_refuses_hides_no_other_effect(
@@ -254,7 +256,9 @@ def test_what_the_gate_refuses_hides_no_other_effect(
 
     def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
         names = [search.terms[t].effect for t in whole.terms]
-        fail = fails if fails != "one of two" else "AB" if len(names) == 2 else ""
+        if len(parts) == 1 and len(names) > 1:  # both against the simulator alone
+            return [Gate(1.0, 1.0 if "alone" in fails else -1.0, 2.0, "episode", False, "alone" in fails)]
+        fail = fails.removesuffix(" alone") if fails != "one of two" else "AB" if len(names) == 2 else ""
         assert [set(whole.terms) - set(part.terms) for part in parts] == [{t} for t in whole.terms]
         # the first is the more uncertain one
         return [Gate(1.0, i - 9.0, 2.0, "episode", harm and n in fail, n not in fail) for i, n in enumerate(names)]
@@ -271,9 +275,9 @@ def test_what_the_gate_refuses_hides_no_other_effect(
 def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     search: Any = Table({"": 0.0, "A": 30.0, "B": 2.0, "AB": 60.0}).search
 
-    def judge(_: Any, __: Any, whole: Trial, ___: Any) -> list[Gate]:
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
         names = [search.terms[t].effect for t in whole.terms]
-        return [Gate(1.0, -1.0, 2.0, "episode", False, name == "B") for name in names]
+        return [Gate(1.0, -1.0, 2.0, "episode", False, name == "B") for name in names[: len(parts)]]
 
     monkeypatch.setattr(acceptance, "gates", judge)
     kept, judged, _ = gated_selection(

@@ -390,6 +390,16 @@ def test_exchange_with_what_an_input_tells_is_between_temperatures_or_concentrat
     assert not catalogue("input_exchange").attach(TANKS, SCALES["tanks"], MEASURED["tanks"])
 
 
+def test_what_a_mutual_exchange_adds_to_one_state_it_takes_from_the_other() -> None:
+    terms = catalogue("mutual_exchange").attach(ROOM, SCALES["room"], MEASURED["room"])
+    assert [t.acts_on for t in terms] == ["T, floor"]  # once per pair, and no dust
+    x, u = [20.0, 30.0, 0.5], [50.0, 45.0, 0.3]
+    before = np.asarray(ROOM.function()(x, u, augment(ROOM, [], MEASURED["room"]).neutral)[0]).ravel()
+    np.testing.assert_allclose(values(ROOM, terms[0], x, u, [0.01])[0] - before, (0.1, -0.1, 0), atol=1e-12)
+    with pytest.raises(ModelError, match=r"effect.e.mutual: its term has no `other`"):
+        Expression("e", "", "first_order", "-k*x", mutual=True, parameters={"k": {"range": [0, 1]}})
+
+
 def test_units_are_one_or_several_and_go_with_no_planar_term() -> None:
     one = Expression("e", "", "first_order", "-k*x", units="degC", parameters={"k": {"range": [0, 1]}})
     assert [t.acts_on for t in one.attach(ROOM, SCALES["room"], MEASURED["room"])] == ["T", "floor"]

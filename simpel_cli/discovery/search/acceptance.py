@@ -47,10 +47,11 @@ def gated_selection(
     while selection.chosen.terms:
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
-        *judged, whole = gates(search, assessor, chosen, [*parts, selection.base])
+        judged = gates(search, assessor, chosen, parts)
         failed = [i for i, found in enumerate(judged) if not found.passed]
-        if whole.passed and all(_helps(judged[i], selection.gains[i]) for i in failed):
-            failed = []
+        if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
+            (whole,) = gates(search, assessor, chosen, [selection.base])
+            failed = [] if whole.passed else failed
         gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
         for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
             _report_gate(search.terms[term].label, found, terminal, out=i == gone)

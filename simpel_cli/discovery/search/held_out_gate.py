@@ -17,7 +17,7 @@ AHEAD = {"one_step": "one row ahead", "ahead": "some rows ahead", "free": "in fr
 FEW = 10  # windows of a record: fewer cannot tell, and blocks of rows are held out
 LEAST_BLOCKS = 20
 LEAST_OF_BLOCK = 8  # rows
-ODD = 5.0
+ODD = 3.0
 MOST_FOLDS = 5
 TOLERATED = 0.02  # of an error: so much it may grow
 SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
@@ -60,8 +60,10 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     windows = search.plan.windows
     measured = search.plan.augmented.measured
     unit = "episode" if len(np.unique(windows.episode)) >= LEAST_EPISODES else "window"
-    if unit == "window" and search.plan.spare is None and len(windows.episode) < FEW:
-        likelihood, errors, named = _of_blocks(search, assessor, trials)
+    few = unit == "window" and search.plan.spare is None and len(windows.episode) < FEW
+    blocks = _blocks(windows) if few else ()
+    if len(blocks) > 1:
+        likelihood, errors, named = _of_blocks(search, assessor, trials, np.array(blocks))
         return [
             _judged(_tempered(likelihood[0] - likelihood[k]), errors[k], errors[0], measured, named, "block")
             for k in range(1, len(trials))
@@ -110,7 +112,7 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
 
 
 def _of_blocks(
-    search: Search, assessor: Assessor, trials: Sequence[Trial]
+    search: Search, assessor: Assessor, trials: Sequence[Trial], blocks: np.ndarray
 ) -> tuple[list[np.ndarray], list[Errors], np.ndarray]:
     """Return log-likelihoods (B,) and errors of every trial on blocks of rows that it was not fitted to, and their numbers.
 
@@ -120,7 +122,6 @@ def _of_blocks(
     Reference: Racine (2000), Consistent cross-validatory model-selection for dependent data (blocks).
     """
     windows = search.plan.windows
-    blocks = _blocks(windows)
     fold = np.random.default_rng(0).permutation(len(blocks)) % MOST_FOLDS
     likelihood: list[np.ndarray] = [np.zeros(len(blocks)) for _ in trials]
     shape = len(blocks), *windows.y.shape[1:]
@@ -150,8 +151,8 @@ def _tempered(gains: np.ndarray) -> np.ndarray:
     return np.clip(gains, -typical, typical)
 
 
-def _blocks(windows: Windows) -> np.ndarray:
-    """Cut windows into about `LEAST_BLOCKS` blocks of at least `LEAST_OF_BLOCK` rows each, (B, W, T)."""
+def _blocks(windows: Windows) -> list[np.ndarray]:
+    """Cut windows into about `LEAST_BLOCKS` blocks of at least `LEAST_OF_BLOCK` rows each, (W, T) each."""
     count, rows = windows.ok.shape[:2]
     found = []
     for w in range(count):
@@ -161,7 +162,7 @@ def _blocks(windows: Windows) -> np.ndarray:
             block = np.zeros((count, rows), bool)
             block[w, part[0] : part[-1] + 1] = True
             found.append(block)
-    return np.array(found)
+    return found
 
 
 def _score(found: Assessment, windows: Windows) -> np.ndarray:

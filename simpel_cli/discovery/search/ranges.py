@@ -90,13 +90,17 @@ def in_words(found: Wider) -> str:
 
 
 def _wider(plan: Setup, trial: Trial) -> dict[int, Range]:
-    """Return wider ranges of the unknowns of a model that stand at an end that may move."""
+    """Return wider ranges of the unknowns of a model that stand at an end that may move.
+
+    Of an effect only its strength: widths and exponents have ranges that say what the effect is.
+    """
     coordinates, found = plan.coordinates, dict[int, Range]()
+    shapes = {i for t in plan.augmented.terms for i, k in zip(plan.augmented.rows(t), t.parameters, strict=True) if k.neutral}
     for row in trial.optimum.free:
         if row >= coordinates.sizes[0] or coordinates.log[row] or coordinates.normal[row]:
             continue
         q, at = plan.augmented.params[row], float(trial.optimum.z[row])
-        if q.role in (SPREAD, MEMBER):
+        if q.role in (SPREAD, MEMBER) or row in shapes:
             continue
         low, high = float(coordinates.low[row]), float(coordinates.high[row])
         span = high - low

@@ -39,7 +39,6 @@ def promises(
     known: tuple[int, ...],
     z: np.ndarray,
     starts: Sequence[tuple[int, Hypothesis]],
-    weight: np.ndarray,
 ) -> list[Score]:
     """Return what each start of each term promises.
 
@@ -50,7 +49,6 @@ def promises(
         known: unknowns that move in the model without the term.
         z: optimum of that model, unit coordinates.
         starts: term and start; parameters whose neutral value is 0 are amplitudes and are switched off, others keep it.
-        weight: what every window counts.
     """
     terms = plan.augmented.terms
     rows = {term: tuple(plan.augmented.rows(terms[term])) for term, _ in starts}
@@ -70,6 +68,7 @@ def promises(
                 break
         else:
             groups.append([i])
+    ones = np.ones(len(plan.windows.episode))
     hypotheses = []
     for group in groups:
         start = z.copy()
@@ -77,7 +76,7 @@ def promises(
             term, hypothesis = starts[i]
             for row, parameter in zip(rows[term], terms[term].parameters, strict=True):
                 start[row] = plan.start[row] if parameter.neutral == 0 else hypothesis.z[row]
-        hypotheses.append(Hypothesis(start, known + tuple(r for i in group for r in rows[starts[i][0]]), weight))
+        hypotheses.append(Hypothesis(start, known + tuple(r for i in group for r in rows[starts[i][0]]), ones))
     found = [UNTOLD] * len(starts)
     for group, optimum in zip(groups, fit(hypotheses, 1), strict=True):
         for i in group:

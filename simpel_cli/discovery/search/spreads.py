@@ -61,7 +61,7 @@ class Spreading:
         found = self.fitter(hypotheses, most)
         if most < MOST:
             return found
-        moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight > 0) and self._here(found[i])]
+        moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight == 1) and self._here(found[i])]
         best = {i: self._paid(found[i]) for i in moving}
         for _ in range(ROUNDS):
             again = {}

@@ -61,8 +61,6 @@ class Search:
         report: takes a line.
         alike: spreads of parameters of the simulator whose groups have one value until a hypothesis frees them; `plan.start`
             has none for them.
-        silent: levels of noise that begin, and stay, as in `plan.start`.
-        weight: what every window counts.
     """
 
     def __init__(
@@ -71,8 +69,6 @@ class Search:
         fitter: Fitter | Spreading,
         report: Callable[[str], None] = lambda _: None,
         alike: Sequence[int] = (),
-        silent: Sequence[int] = (),
-        weight: float = 1.0,
     ) -> None:
         self.plan, self.report = plan, report
         self.terms = plan.augmented.terms
@@ -84,7 +80,7 @@ class Search:
         # unknowns that begin, and stay, as in `plan.start`
         self.still = (*last, *(i for row in alike for i in (row, *every[row])))
         self.always = tuple(i for i in range(len(params)) if i not in every and i not in self.still)
-        self.noise = tuple(i for i in range(n_p, n_p + n_r + n_q) if i not in silent)
+        self.noise = tuple(range(n_p, n_p + n_r + n_q))
         self.always += self.noise
         self.rows = [tuple(plan.augmented.rows(t)) for t in self.terms]
         differing = [plan.augmented.spreads(t) for t in self.terms]
@@ -94,8 +90,7 @@ class Search:
         self.spreads_of = [tuple(each) for each in differing]
         inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
-        self.width = fitter.width - len(silent)  # every level of noise has its place in the program
-        self.ones = np.full(len(plan.windows.episode), weight)
+        self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
@@ -111,11 +106,11 @@ class Search:
 
     def fits(self, terms: Sequence[int]) -> bool:
         """Whether the compiled program has room for them."""
-        return len(self.free(terms)) <= self.width
+        return len(self.free(terms)) <= self.fitter.width
 
     def promises(self, before: Trial, starts: Sequence[tuple[int, Hypothesis]]) -> list[Score]:
         """Return what each start of each term promises beside a fitted set."""
-        return promises(self.plan, self.fitter, self.width, self.free(before.terms), before.optimum.z, starts, self.ones)
+        return promises(self.plan, self.fitter, self.fitter.width, self.free(before.terms), before.optimum.z, starts)
 
     def hypotheses(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Hypothesis]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""
@@ -320,7 +315,7 @@ class Search:
         term, here, there = self.terms[trial.terms[-1]], trial.optimum, chosen.optimum
         if term.depends_on:
             return here.log_evidence >= there.log_evidence + ACCEPT
-        if self.terms[own].effect in term.generalises:
+        if self.terms[own].effect in term.generalises and self.terms[own].acts_on == term.acts_on:
             return False
         fits = len(term.parameters) <= len(self.terms[own].parameters) and here.loss <= there.loss + SAME
         return fits or here.log_evidence >= there.log_evidence - TIE

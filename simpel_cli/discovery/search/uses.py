@@ -9,7 +9,8 @@ model will be used,
 sigma and tau the size and the integrated autocorrelation time of the errors before. The second term is the variance of a
 uniform prior, about where the innovations put it: what these errors do not tell stays there.
 
-Reference: Ljung (1999), System identification, 7.2 (output error); Nocedal and Wright (2006), Numerical optimization, 10.3.
+Reference: Ljung (1999), System identification, 7.2 (output error); Geyer (1992), Practical Markov chain Monte Carlo, 3.3 (tau);
+Nocedal and Wright (2006), Numerical optimization, 10.3.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,6 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from simpel_cli.discovery.search.simulation import correlation_time
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
@@ -28,6 +28,8 @@ ONE_STEP, FREE_RUN = "one_step", "free_run"
 NUDGE = 1e-4  # of a range, for differences
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 30  # evaluations
+MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
+CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
 
 Errors = Callable[[np.ndarray], np.ndarray]  # (models, n) -> (models, W, T, ny)
 
@@ -39,7 +41,7 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
         search: that it comes from.
         assessor: of its program.
         trial: the model as the innovations calibrated it.
-        windows: of all training rows, as long as they are for a free run.
+        windows: of the training rows, each as long as its episode.
         use: ONE_STEP, FREE_RUN, or how far ahead, s.
     """
     rows = [i for i in trial.optimum.free if i not in search.noise]
@@ -49,7 +51,8 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     z = trial.optimum.z
     before = errors(z[None])[0]
     tau = correlation_time(before)
-    sigma = np.sqrt(np.nanmean(before.reshape(-1, before.shape[-1]) ** 2, axis=0))
+    count = np.isfinite(before).sum(axis=(0, 1))
+    sigma = np.sqrt(np.nansum(before**2, axis=(0, 1)) / np.maximum(count, 1))
     there = np.isfinite(windows.y) & (windows.ok > 0) & np.isfinite(before) & (sigma > 0)
     if not there.any():
         return trial
@@ -77,6 +80,21 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     moved = z.copy()
     moved[rows] = found.x
     return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
+
+
+def correlation_time(errors: np.ndarray) -> float:
+    """Return the mean over channels of the integrated autocorrelation time of errors (W, T, ny), rows, at least 1."""
+    found = []
+    for j in range(errors.shape[2]):
+        e = np.where(np.isfinite(errors[..., j]), errors[..., j], 0.0)
+        rows = e.shape[1]
+        lags = np.array([np.sum(e[:, : rows - k] * e[:, k:]) for k in range(rows)])
+        if not lags[0] > 0:
+            continue
+        r = lags / lags[0]
+        end = int(np.argmax(r < CORRELATED)) or rows
+        found.append(1 + 2 * float(r[1:end].sum()))
+    return max(float(np.mean(found)), 1.0) if found else 1.0
 
 
 def _placed(trial: Trial, rows: list[int], z: np.ndarray, covariance: np.ndarray) -> Any:

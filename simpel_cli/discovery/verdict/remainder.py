@@ -29,6 +29,19 @@ def remainder_of(
     return found or _followed(search, selection.chosen, learnt)
 
 
+def still_wrong(search: Search, chosen: Trial, worst: str, times: float, horizon: int) -> dict[str, Any]:
+    """Describe errors that stay far above the noise, of which nothing else is known."""
+    return {
+        "acts_on": worst,
+        "depends_on": [],
+        "rms": noise_of(search, chosen)[1] / np.sqrt(search.plan.augmented.model.dt),
+        "unit": _unit(search, worst),
+        "log_evidence_gain": None,
+        "description": f"the errors of {worst} {horizon} rows ahead stay {times:.2g} times as large as its noise, and no "
+        "function of the states and inputs that was tried makes them smaller",
+    }
+
+
 def dependence(remainder: dict[str, Any]) -> str:
     """Return what the remaining model error depends on, in words."""
     period = remainder.get("period")

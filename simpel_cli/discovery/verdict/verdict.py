@@ -10,13 +10,15 @@ from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
-from simpel_cli.discovery.verdict.remainder import dependence, noise_of
+from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
+from simpel_cli.discovery.verdict.share import explained
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of
 from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
+ALL = 0.95  # of the residual
 LOST = -20.0  # nats: a fit so far below the simpler model has not converged, and its size has no meaning
 SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
 Z95 = 1.959963984540054
@@ -56,6 +58,9 @@ def verdict_of(
     else:
         kind = EFFECT if all(len(d) == 1 for d in different) else AMBIGUOUS
     measured = search.plan.augmented.measured
+    part = explained(rmse(before.ahead), rmse(after.ahead), np.array(noise_of(search, chosen)[0]))
+    if kind == EFFECT and not part.enough(left=remainder is not None):
+        kind, remainder = UNEXPLAINED, remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon)
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
     interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
     found = {
@@ -77,6 +82,7 @@ def verdict_of(
                 zip(measured, (float(v) for v in rmse(after.one_step / np.sqrt(after.variance))), strict=True)
             ),
         },
+        "share_explained": part.share,
         "noise_floor": dict(zip(measured, noise_of(search, chosen)[0], strict=True)),
         "process_noise": {
             "before": noise_of(search, selection.base)[1],
@@ -226,12 +232,13 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         gain = (
             f"No test episode is longer than {steps} rows, so the error so far ahead is not known (discovery.horizon)."
         )
-    parts = [_phrase(e) for e in found["effects"]]
+    parts, share = [_phrase(e) for e in found["effects"]], max(found["share_explained"], 0.0)
     listed = " and ".join(parts)
     rest = f" The remaining model error depends on {dependence(found['remainder'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
-            return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} the residual. {gain}{rest}"
+            much = f"{share:.0%} of the model error" if share < ALL else "the residual"
+            return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} {much}. {gain}{rest}"
         case "ambiguous":
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
             names = " or ".join(_distinct(tied))
@@ -242,7 +249,8 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
             )
             return f"Causes that fit these data equally well: {names}.{also} {gain}{rest}"
         case "unexplained":
-            return f"No known effect explains the model error: {found['remainder']['description']}."
+            also = f" Found on the way, {share:.0%} of it: {listed}. {gain}" if parts else ""
+            return f"No known effect explains the model error: {found['remainder']['description']}.{also}"
         case _:
             text = "No missing effect was found: the calibrated simulator explains these data"
             if not np.array_equal(first, second, equal_nan=True):

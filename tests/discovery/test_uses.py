@@ -1,0 +1,68 @@
+"""The last calibration is for the use that is named."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_ranges import measured, searched
+
+from simpel_cli.config.build import build
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, correlation_time
+from simpel_cli.errors import ConfigError
+from simpel_cli.filtering.errors_ahead import Assessor, rmse
+from simpel_cli.filtering.setup import test_windows as held_out  # pytest would take it for a test
+
+
+@pytest.mark.parametrize("use", [FREE_RUN, 1.0])
+def test_a_wrong_model_simulates_better_when_it_is_calibrated_for_that(use: Any) -> None:
+    """The simulator has no drag: what predicts the next row best drifts away in a free run."""
+    recording = measured(1.2, k=0.3)
+    search = searched(recording, [])
+    base, assessor = search.base(), Assessor(search.plan, 10)
+    windows = held_out(search.plan, recording.train, ())
+    suited = calibrated_for(search, assessor, base, windows, use)
+    before, after = (assessor(t.optimum.z, windows) for t in (base, suited))
+    far = "free" if use == FREE_RUN else "ahead"
+    first, second = (rmse(getattr(a, far)) for a in (before, after))
+    assert np.prod(second) < (0.95 if use == FREE_RUN else 0.99) * np.prod(first)
+    noise = list(search.noise)
+    np.testing.assert_array_equal(suited.optimum.z[noise], base.optimum.z[noise])
+    assert suited.optimum.log_evidence == base.optimum.log_evidence
+    i = suited.optimum.free.index(0)
+    assert suited.optimum.centre[i] == suited.optimum.z[0]
+    assert 0 < suited.optimum.covariance[i, i] < 1 / 12
+    assert calibrated_for(search, assessor, base, windows, ONE_STEP) is base
+
+
+def test_the_right_model_stays_where_it_is() -> None:
+    recording = measured(1.2)
+    search = searched(recording, [])
+    base, assessor = search.base(), Assessor(search.plan, 10)
+    windows = held_out(search.plan, recording.train, ())
+    suited = calibrated_for(search, assessor, base, windows, FREE_RUN)
+    assert suited.optimum.z[0] == pytest.approx(base.optimum.z[0], abs=2e-3)
+
+
+def test_correlation_time_of_an_autoregression() -> None:
+    random = np.random.default_rng(0)
+    e = random.normal(size=(40, 500, 1))
+    for k in range(1, 500):
+        e[:, k] += 0.8 * e[:, k - 1]
+    assert correlation_time(e) == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.15)
+    assert correlation_time(random.normal(size=(40, 500, 1))) == pytest.approx(1.0, abs=0.05)
+    assert correlation_time(np.full((2, 5, 1), np.nan)) == 1.0
+
+
+@pytest.mark.parametrize("given", ["free_run", "one_step", 0.5, 2, None])
+def test_the_key_is_for(given: Any) -> None:
+    assert build({"for": given}, "discovery").for_ == given
+    assert Discovery().for_ is None
+
+
+@pytest.mark.parametrize("given", ["free", "0.5 s", 0, -1.0, [1]])
+def test_a_wrong_use_is_told_what_is_allowed(given: Any) -> None:
+    with pytest.raises(ConfigError, match=r"discovery\.for"):
+        build({"for": given}, "discovery")
+    with pytest.raises(ConfigError, match=r"discovery\.fo: .*discovery\.for\?"):
+        build({"fo": given}, "discovery")
