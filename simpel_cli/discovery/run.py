@@ -165,13 +165,13 @@ def _correct(
     assert isinstance(model, Model)
     per = per_of(searched.groupings)
     nowhere = [f"{name} per {by} ({IN_PYTHON})" for name, by in per.items() if name not in declared_in(config["sim"])]
-    nowhere += [
-        f"the range of {b.name} ({IN_PYTHON})" for b in outside if b.name not in declared_in(config["sim"])
-    ]
+    nowhere += [f"the range of {b.name} ({IN_PYTHON})" for b in outside if b.name not in declared_in(config["sim"])]
     changes = len(per) + len(outside)
     if not found["effects"] and len(nowhere) == changes:
         return {"corrected_sim_lacks": nowhere}
-    name, node, left_out = corrected(ranged(written(config["sim"], per), outside), model, searched.search, searched.selection.chosen)
+    name, node, left_out = corrected(
+        ranged(written(config["sim"], per), outside), model, searched.search, searched.selection.chosen
+    )
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
     for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):

@@ -249,7 +249,9 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
         terminal.line("searching once more", "groups")
 
 
-def _with(ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool) -> Searched | Wider | list[Grouping]:
+def _with(
+    ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
+) -> Searched | Wider | list[Grouping]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:

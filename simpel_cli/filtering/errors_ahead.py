@@ -76,7 +76,9 @@ class Assessor:
             windows: of any shape.
         """
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
-        free = np.asarray(_free_program(self.plan.rule, self.plan.coordinates.layout)(bounds, jnp.asarray(z), *windows.arrays))
+        free = np.asarray(
+            _free_program(self.plan.rule, self.plan.coordinates.layout)(bounds, jnp.asarray(z), *windows.arrays)
+        )
         error = self._wrapped(windows.y - free) * np.where(windows.ok > 0, 1.0, np.nan)
         error[:, :, :SETTLE] = np.nan
         return error

@@ -15,7 +15,9 @@ from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression
 from simulators.model import Declared, Model
 
-DRAG = Expression("drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 0.2], "unit": "1/s", "starts": [0.1]}})
+DRAG = Expression(
+    "drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 0.2], "unit": "1/s", "starts": [0.1]}}
+)
 WIDTH = Expression(
     "dry", acts_on="v", term="-c*tanh(v/w)",
     parameters={"c": {"range": [0, 2], "unit": "m/s^2"}, "w": {"range": [0.5, 1], "neutral": 0.5, "unit": "m/s"}},
@@ -109,7 +111,9 @@ def test_an_effect_stronger_than_its_range_is_not_cut_there() -> None:
 
 def test_the_simulator_alone_is_no_reason_where_an_effect_explains_more() -> None:
     """With a drag of 0.5 1/s and none in the simulator a gain too small fits better; the drag itself explains far more."""
-    wide = Expression("drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 2], "unit": "1/s", "starts": [0.3]}})
+    wide = Expression(
+        "drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 2], "unit": "1/s", "starts": [0.3]}}
+    )
     search = searched(measured(0.82, k=0.5), [wide])
     base = search.base()
     row = [q.name for q in search.plan.augmented.params].index("b")

@@ -12,7 +12,9 @@ from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
 
-STRONG = 20.0  # nats of evidence: an effect that earns so much may be uncertain on few held-out parts, if the set is not
+STRONG = (
+    20.0  # nats of evidence: an effect that earns so much may be uncertain on few held-out parts, if the set is not
+)
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
 

@@ -95,7 +95,9 @@ def _wider(plan: Setup, trial: Trial) -> dict[int, Range]:
     Of an effect only its strength: widths and exponents have ranges that say what the effect is.
     """
     coordinates, found = plan.coordinates, dict[int, Range]()
-    shapes = {i for t in plan.augmented.terms for i, k in zip(plan.augmented.rows(t), t.parameters, strict=True) if k.neutral}
+    shapes = {
+        i for t in plan.augmented.terms for i, k in zip(plan.augmented.rows(t), t.parameters, strict=True) if k.neutral
+    }
     for row in trial.optimum.free:
         if row >= coordinates.sizes[0] or coordinates.log[row] or coordinates.normal[row]:
             continue

@@ -71,6 +71,7 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
         return ((both[1:] - both[0]) / step[:, None]).T
 
     begin = np.clip(z[rows], NUDGE, 1 - NUDGE)
+
     def one(at: np.ndarray) -> np.ndarray:
         return residual(at[None])[0]
 

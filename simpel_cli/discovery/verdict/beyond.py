@@ -45,7 +45,9 @@ def beyond(model: Model, search: Search, chosen: Trial, gain: float) -> list[Bey
             continue
         at = interval_of(search, chosen, row)
         if not declared.low <= at["value"] <= declared.high:
-            found.append(Beyond(q.name, q.unit, (declared.low, declared.high), at["value"], at["low"], at["high"], gain))
+            found.append(
+                Beyond(q.name, q.unit, (declared.low, declared.high), at["value"], at["low"], at["high"], gain)
+            )
     return found
 
 

@@ -60,7 +60,10 @@ def verdict_of(
     measured = search.plan.augmented.measured
     part = explained(rmse(before.ahead), rmse(after.ahead), np.array(noise_of(search, chosen)[0]))
     if kind == EFFECT and not part.enough(left=remainder is not None):
-        kind, remainder = UNEXPLAINED, remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon)
+        kind, remainder = (
+            UNEXPLAINED,
+            remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon),
+        )
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
     interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
     found = {
