@@ -2,7 +2,8 @@
 
 Every set is written, given to `simpel discover` as a user would, and scored against a truth that the tool cannot reach.
 `--out` of an earlier exam goes on with it; `--only` leaves the other systems to other runs on the same `--out`, now or later;
-`--score-only` scores anew what was run there. The table is of all sets in that folder.
+`--score-only` scores anew what was run there. The table is of all sets in that folder. `--second` is the second exam, whose
+measurements have the nuisances of real rigs.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import pandas as pd
 
 from tests.exam import rivals, score
 from tests.exam.campaign import keep, neighbours, put, run, score_file
-from tests.exam.draw import OUTSIDE, draw
+from tests.exam.draw import OUTSIDE, draw, draw_second
 from tests.exam.examine import examine, places
 from tests.exam.plants import SYSTEMS
 from tests.exam.table import report
@@ -38,6 +39,7 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="+", choices=SYSTEMS, default=list(SYSTEMS), metavar="SYSTEM", help=str([*SYSTEMS])
     )
+    parser.add_argument("--second", action="store_true", help="with nuisances of real rigs")
     parser.add_argument("--workers", type=int, default=2, choices=range(1, MOST_WORKERS + 1))
     parser.add_argument("--score-only", type=Path, metavar="DIR", help="score the runs of an earlier exam anew")
     options = parser.parse_args()
@@ -56,9 +58,15 @@ def main() -> None:
         return
     if earlier.get("seed", options.seed) != options.seed:
         parser.error(f"{out} holds the exam with seed {earlier['seed']}")
-    told = {"seed": options.seed, "sets": options.sets, "tuned": earlier.get("tuned") or tuned()}
+    if "seed" in earlier and earlier.get("second", False) != options.second:
+        parser.error(f"{out} holds the {'second' if earlier.get('second') else 'first'} exam")
+    told = {
+        "seed": options.seed, "sets": options.sets, "second": options.second,
+        "tuned": {} if options.second else earlier.get("tuned") or tuned(),
+    }  # fmt: skip
     put(out / PLAN, told)
-    sets = [d for d in (draw(i, options.seed) for i in range(options.sets)) if d.system in options.only]
+    drawn_by = draw_second if options.second else draw
+    sets = [d for d in (drawn_by(i, options.seed) for i in range(options.sets)) if d.system in options.only]
     waiting = [d for d in sets if not score_file(out, d.index).exists()]
     run(sorted(waiting, key=neighbours), out, told["tuned"], options.workers)
     finish(out)
@@ -72,7 +80,7 @@ def plan(out: Path) -> dict[str, Any]:
 def again(path: Path, out: Path, told: Mapping[str, Any]) -> None:
     """Score anew; what was not run stays as it was."""
     old = json.loads(path.read_text())
-    drawn = draw(old["index"], told["seed"])
+    drawn = (draw_second if told.get("second") else draw)(old["index"], told["seed"])
     if (places(out, drawn.index)[0] / "run" / "verdict.json").exists():
         keep(out, examine(drawn, out, told["tuned"]) | {"wall": old["wall"], "memory_mb": old.get("memory_mb")})
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.exam import nuisances
 from tests.exam.mujoco_plants import can
 from tests.exam.planted import (
     ABSORBED,
@@ -49,6 +50,7 @@ class Set(NamedTuple):
         condition: how it was measured and driven.
         world: own or mujoco.
         seed: of everything that is random in its data.
+        nuisances: of the second exam: what its measurements are like beside their noise.
     """
 
     index: int
@@ -60,6 +62,7 @@ class Set(NamedTuple):
     condition: str
     world: str
     seed: int
+    nuisances: tuple[str, ...] = ()
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -91,6 +94,13 @@ def draw(index: int, seed: int) -> Set:
         "mujoco" if random.random() < IN_MUJOCO.get(kind, 0.0) * mujoco else "own",
         int(random.integers(2**31)),
     )  # fmt: skip
+
+
+def draw_second(index: int, seed: int) -> Set:
+    """Draw set number `index` of the second exam `seed`: own systems, everything measured, with nuisances."""
+    drawn = draw(index, seed)._replace(condition=FULL, world="own")
+    random = np.random.default_rng((seed, index, 2))
+    return drawn._replace(nuisances=nuisances.drawn(random, SYSTEMS[drawn.system], drawn.effects))
 
 
 def possible(system: str, condition: str, effects: tuple[Effect, ...]) -> bool:

@@ -11,6 +11,8 @@ import pandas as pd
 
 from tests.exam import score
 from tests.exam.draw import Set
+from tests.exam.nuisances import named
+from tests.exam.plants import SYSTEMS
 from tests.exam.rivals import rivals
 from tests.exam.tool import discover
 from tests.exam.write import write
@@ -64,5 +66,8 @@ def _scored(truth: dict[str, Any], folder: Path) -> dict[str, Any]:
         "evidence": score.evidence(truth, graded, found, gains, oracle),
         "of_oracle": score.error_ratio(found, oracle) if truth["effects"] and (oracle or graded == score.RIGHT) else None,
         "of_before": score.error_ratio(found, found, "before"), "covered": inside, "intervals": counted,
+        "nuisances": "+".join(truth.get("nuisances", ())),
+        "named": json.dumps(named(tuple(truth.get("nuisances", ())), SYSTEMS[truth["system"]], found)),
+        "grown": ",".join(found["error"].get("grows", ())),
         "seconds": found["seconds"], "candidates": found["candidates_tried"], "summary": found["summary"],
     }  # fmt: skip

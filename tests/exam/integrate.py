@@ -36,6 +36,7 @@ def simulate(
     tap: float = 0.0,
     play: Sequence[float] = (),
     sensor_lag: np.ndarray | None = None,
+    linear: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrate a batch of episodes.
 
@@ -52,6 +53,7 @@ def simulate(
         fine: steps per row.
         tap: s after each row, less than dt: where the states are recorded a second time, for late sensors.
         play: half width of the play in front of each input; none = 0.
+        linear: commands go straight from a row to the next.
         sensor_lag: (nx,) time constants of sensors with a first-order lag, s; 0 = none. They begin at the first states.
 
     Returns:
@@ -82,8 +84,14 @@ def simulate(
             middle = row + ((a + b) / 2 - late) / dt
             given = np.clip(np.floor(middle).astype(int), 0, rows - 1)
             held = np.stack([passed[:, k, j] for j, k in enumerate(given)], -1)
+            rise = np.zeros_like(held)
+            if linear:  # commands at the beginning of the step, and how they rise along it
+                way = np.clip(row + (a - late) / dt - given, 0.0, 1.0)
+                following = np.stack([passed[:, min(k + 1, rows - 1), j] for j, k in enumerate(given)], -1)
+                rise = (following - held) * (b - a) / dt
+                held = held + (following - held) * way
             before = x
-            x, z = _step(rate, x, z, held, slow, row * dt + a, b - a)
+            x, z = _step(rate, x, z, held, slow, row * dt + a, b - a, rise)
             if slowly:
                 read = _followed(read, before, x, sensor_lag, b - a)
             if diffusion is not None and random is not None:
@@ -110,13 +118,15 @@ def _followed(read: np.ndarray, before: np.ndarray, after: np.ndarray, lag: np.n
 
 
 def _step(
-    rate: Rate, x: np.ndarray, z: np.ndarray, held: np.ndarray, slow: np.ndarray, t: float, h: float
+    rate: Rate, x: np.ndarray, z: np.ndarray, held: np.ndarray, slow: np.ndarray, t: float, h: float, rise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One step of classical Runge-Kutta of the states; the lags are linear and solved exactly."""
+    """One step of classical Runge-Kutta of the states; lags are solved exactly, for commands that are held or rise."""
     at = []
     for share in (0.0, 0.5, 1.0):
-        decay = np.where(slow > 0, np.exp(-share * h / np.where(slow > 0, slow, 1.0)), 0.0)
-        at.append(held + (z - held) * decay)
+        tau = np.where(slow > 0, slow, 1.0)
+        decay = np.where(slow > 0, np.exp(-share * h / tau), 0.0)
+        behind = np.where(slow > 0, tau / h, 0.0) * rise  # a lag follows a ramp at this distance
+        at.append(held + share * rise - behind + (z - held + behind) * decay)
     k1 = rate(x, at[0], t)
     k2 = rate(x + h / 2 * k1, at[1], t + h / 2)
     k3 = rate(x + h / 2 * k2, at[1], t + h / 2)

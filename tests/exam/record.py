@@ -1,10 +1,11 @@
 """From a set to what its sensors read: plant, episodes, sensors, noise. Of this the tool gets what was measured only."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.exam import mujoco_plants
+from tests.exam import mujoco_plants, nuisances
 from tests.exam.draw import CLOSED, DERIVED, NONE, OUTLIERS, QUANTISED, SHAKEN, Set
 from tests.exam.integrate import Rate, simulate
 from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, OWN_RATE, PLAY, RATE, SENSOR, SLOW_SENSOR, Effect
@@ -48,8 +49,11 @@ def record(drawn: Set) -> Record:
     effects, knobs = drawn.effects, tuple(e.knobs(s) for e, s in zip(drawn.effects, drawn.strength, strict=True))
     count = TRAIN + TEST
     start, commands = system.start(random, count), system.commands(random, count, ROWS + 2)
+    seconds = ROWS * system.dt
+    _, at = nuisances.parameters_of(drawn.nuisances, random_of(drawn, 1), parameters, count, seconds)
     controller = _controller(system, random, count) if drawn.condition == CLOSED else None
-    lead, share, channel = _late_sensor(system, effects, knobs)
+    lead, share, channel = _late_sensor(drawn, system, effects, knobs)
+    behind = lead
     settling = _settling(system, effects, knobs)
     if lead:
         commands[:, :lead] = commands[:, lead : lead + 1]
@@ -71,26 +75,36 @@ def record(drawn: Set) -> Record:
     else:
         late, slow, play = (_of_inputs(system, effects, knobs, kind) for kind in (DELAY, LAG, PLAY))
         states, tapped, commands = simulate(
-            plant(system, parameters, effects, knobs), start, commands, system.dt, controller=controller,
+            plant(system, parameters, effects, knobs, at), start, commands, system.dt, controller=controller,
             delay=late, lag=slow, play=play, diffusion=diffusion, random=random, tap=share * system.dt, sensor_lag=settling,
+            linear=nuisances.LINEAR in drawn.nuisances,
         )  # fmt: skip
     rows = slice(lead, lead + ROWS)
     true, given = states[:, rows], commands[:, rows]
     clean = _sensors(system, effects, knobs, true)
     if channel is not None:  # a late sensor reads what was `share` of a row after the row before, or the one before it
-        behind = int(np.ceil(knobs[0]["d"] / system.dt - 1e-9))
         clean[..., channel] = tapped[:, lead - behind : lead - behind + ROWS, channel]
     for i in np.flatnonzero(settling):
         clean[..., i] = tapped[:, rows, i]
     noise = drawn.noise * clean[:TRAIN].std(axis=(0, 1))
-    measured = clean + noise * random.standard_normal(clean.shape)
+    measured = clean + noise * nuisances.noise_of(drawn.nuisances, random, clean.shape)
+    measured = nuisances.faulty(drawn.nuisances, system, measured, noise, random_of(drawn, 2))
     return Record(true, clean, _faults(drawn, system, measured, noise, random), given, noise, parameters, knobs)
 
 
+def random_of(drawn: Set, use: int) -> np.random.Generator:
+    """Return random numbers of a set that are no others': a nuisance changes nothing else of it."""
+    return np.random.default_rng((drawn.seed, use))
+
+
 def plant(
-    system: System, parameters: dict[str, float], effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]
+    system: System,
+    parameters: dict[str, float],
+    effects: tuple[Effect, ...],
+    knobs: tuple[dict[str, float], ...],
+    at: Callable[[float], dict[str, Any]] | None = None,
 ) -> Rate:
-    """Return the right-hand side with everything planted that acts on rates and inputs."""
+    """Return the right-hand side with everything planted that acts on rates and inputs; at: parameters at a time."""
 
     def rate(x: np.ndarray, u: np.ndarray, t: float) -> np.ndarray:
         u = np.array(u)
@@ -98,7 +112,7 @@ def plant(
             if effect.kind == INPUT:
                 j = system.inputs.index(effect.acts_on)
                 u[..., j] = effect.formula(u[..., j], k)
-        dx = system.rate(x, u, parameters)
+        dx = system.rate(x, u, parameters if at is None else at(t))
         for effect, k in zip(effects, knobs, strict=True):
             if effect.kind not in (RATE, OWN_RATE):
                 continue
@@ -129,12 +143,16 @@ def truth(drawn: Set, made: Record) -> dict[str, Any]:
     ]  # fmt: skip
     absorbed = drawn.kind == NONE and bool(effects)
     ranges = SYSTEMS[drawn.system].ranges
+    absent = nuisances.parameters_of(drawn.nuisances, random_of(drawn, 1), made.parameters, 1, 1.0)[0]
     return {n: v for n, v in drawn._asdict().items() if n not in ("planted", "strength")} | {
         "effects": [] if drawn.kind == NONE else effects,
         "absorbed": effects if absorbed else [],
         "measured": list(drawn.measured),
         # of what is planted in MuJoCo, or taken in by them, the parameters that fit are others
-        "parameters": {} if absorbed else {n: {"value": v, "range": ranges[n]} for n, v in made.parameters.items()},
+        "parameters": {}
+        if absorbed
+        else {n: {"value": v, "range": ranges[n]} for n, v in made.parameters.items() if n != absent},
+        "may_be": sorted(nuisances.may_be(drawn.nuisances, SYSTEMS[drawn.system])),
     }
 
 
@@ -158,9 +176,13 @@ def _settling(system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str
 
 
 def _late_sensor(
-    system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]
+    drawn: Set, system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]
 ) -> tuple[int, float, int | None]:
     """Rows in front of the record, share of a row at which the states are recorded once more, and the late channel."""
+    if nuisances.LATE in drawn.nuisances:
+        rows = nuisances.ROWS_LATE
+        speed = system.states.index(next(iter(system.velocity)))
+        return int(np.ceil(rows)), float(np.ceil(rows) - rows), speed
     for effect, k in zip(effects, knobs, strict=True):
         if effect.kind == LATE_SENSOR:
             rows = k["d"] / system.dt

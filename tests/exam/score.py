@@ -32,7 +32,11 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
         found: `verdict.json`.
         gains: evidence of the candidates in the first step.
     """
-    claimed, kind = found["effects"], truth["kind"]
+    allowed = {tuple(pair) for pair in truth.get("may_be", ())}  # a nuisance of a sensor may be named as such
+    claimed = [
+        e for e in found["effects"] if not allowed & {(m["name"], m["acts_on"]) for m in e.get("class_members", [])}
+    ]
+    kind = truth["kind"]
     if kind == "none":
         return FALSE if claimed else RIGHT if found["verdict"] == "none" else UNEXPLAINED
     if kind == "outside":

@@ -3,6 +3,7 @@
 Reference: Clopper and Pearson (1934), The use of confidence or fiducial limits, 95 %.
 """
 
+import json
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ DEFAULT = 10**-0.5  # strengths above are a catalogue's usual ones: the upper ha
 HARMLESS = 1.02  # of the error before
 WITHIN = 0.05  # of the share under full measurement
 EQUAL = (POSITION, CLOSED, SHAKEN)  # conditions that the bar asks this of
+TOLD_LEAST = 0.8  # of the sets with a nuisance of which it is said what it is
 SLOWEST = 10.0  # s, two states
 TOLD = ("simpel", "PySINDy", "BIC")
 COLUMN = {"simpel": "outcome", "PySINDy": "pysindy", "BIC": "bic"}
@@ -103,7 +105,11 @@ def report(scores: pd.DataFrame) -> str:
     if "strength" not in t:
         t["strength"] = np.nan
     parts = [f"# Blind exam: {len(t)} sets\n", _markdown(_bars(t)), f"\n{ABOUT}\n\n## Cost\n\n{_markdown(_cost(t))}"]
-    parts += [f"\n## By {by}\n\n{_markdown(_split(t, by))}" for by in ("kind", "condition", "system", "noise", "world")]
+    parts += [
+        f"\n## By {by}\n\n{_markdown(_split(t, by))}"
+        for by in ("kind", "condition", "system", "noise", "world", "nuisances")
+        if by in t
+    ]
     failing = t[t.outcome.isin([WRONG, FALSE, ERROR, PART, HEDGED])]
     if len(failing):
         keys = ["index", "system", "condition", "noise", "planted", "outcome", "names", "evidence", "message"]
@@ -152,8 +158,28 @@ def _numbers(t: pd.DataFrame) -> list[dict[str, str]]:
          "simpel": share(safe, len(none)), "met": _met(safe / len(none), 1, 1) if len(none) else ""},
         {"figure": "intervals of parameters and effects that cover (claimed: 90 %)", "bar": "86-96 %",
          "simpel": share(inside, counted), "met": _met(inside / counted, 0.86, 0.96) if counted else ""},
-        *(_time(t, states) for states in (2, 4)),
+        *_grown(t), *_told(t), *(_time(t, states) for states in (2, 4)),
     ]  # fmt: skip
+
+
+def _grown(t: pd.DataFrame) -> list[dict[str, str]]:
+    """Row of the sets with an error on test episodes that certainly grows, at any horizon."""
+    if "grown" not in t:
+        return []
+    of = t.grown.dropna()
+    row = {"figure": "an error on test episodes grows certainly, any quantity and horizon", "bar": "0"}
+    return [row | {"simpel": share(int((of != "").sum()), len(of)), "met": "NO" if (of != "").any() else "yes"}]
+
+
+def _told(t: pd.DataFrame) -> list[dict[str, str]]:
+    """Rows of the nuisances: of how many sets the tool says that they are there."""
+    said = [json.loads(text) for text in t.get("named", pd.Series(dtype=object)).dropna()]
+    rows = []
+    for name in sorted({n for each in said for n in each}):
+        answers = [each[name] for each in said if name in each]
+        rows.append({"figure": f"nuisance named: {name}", "bar": ">= 80 %", "simpel": share(sum(answers), len(answers)),
+                     "met": _met(sum(answers) / len(answers), TOLD_LEAST, 1.0)})  # fmt: skip
+    return rows
 
 
 def _searched(t: pd.DataFrame) -> pd.DataFrame:

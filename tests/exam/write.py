@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from tests.exam.draw import OUTSIDE, Set
+from tests.exam.nuisances import DIFFERING
 from tests.exam.plants import SYSTEMS
 from tests.exam.record import TRAIN, Record, record, truth
 from tests.exam.visible import visible
@@ -24,6 +25,8 @@ def table(drawn: Set, made: Record) -> pd.DataFrame:
             columns[name] = made.measured[..., i].ravel()
     columns |= {name: made.commands[..., j].ravel() for j, name in enumerate(system.inputs)}
     frame = pd.DataFrame(columns)
+    if DIFFERING in drawn.nuisances:  # every episode is another unit of the rig, which the data say
+        frame["unit"] = frame.episode.map("unit{}".format)
     frame["split"] = np.where(frame.episode < TRAIN, "train", "test")
     return frame
 
@@ -42,8 +45,9 @@ def write(drawn: Set, folder: Path, truth_file: Path) -> None:
     (folder / "sim" / "rig.yaml").write_text((NOMINAL / f"{drawn.system}.yaml").read_text())
     table(drawn, made).to_parquet(folder / "data" / "run.parquet")
     missing = ", ".join(f"{n}: null" for n in SYSTEMS[drawn.system].states if n not in drawn.measured)
+    groups = "groups: [unit]\n" if DIFFERING in drawn.nuisances else ""
     (folder / "data" / "rig.yaml").write_text(
-        f"path: run.parquet\ntime: t\nepisode: episode\ncolumns: {{{missing}}}\nsplit: {{column: split}}\n"
+        f"path: run.parquet\ntime: t\nepisode: episode\ncolumns: {{{missing}}}\nsplit: {{column: split}}\n{groups}"
     )
     known = truth(drawn, made)
     if drawn.kind == OUTSIDE:

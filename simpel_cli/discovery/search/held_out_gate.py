@@ -224,6 +224,11 @@ def _judged(
     return Gate(float(gains.sum()), low, high, unit, bool(grows), bool(low > 0) and not grows, grows)
 
 
+def errors_of(found: Assessment) -> Errors:
+    """Return the errors of a model by horizon."""
+    return {words: getattr(found, name) for name, words in AHEAD.items()}
+
+
 def growing(before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray) -> tuple[str, ...]:
     """Return which errors grow by more than is tolerated, certainly: of what, and how far ahead.
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Check
-from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.held_out_gate import Gate, errors_of, growing
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases
@@ -80,6 +80,7 @@ def verdict_of(
             "before": results(before, measured, rows),
             "after": results(after, measured, rows),
             "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
+            "grows": list(growing(errors_of(before), errors_of(after), measured, windows.episode)),
             "horizon_steps": horizon,
             "surprise": dict(
                 zip(measured, (float(v) for v in rmse(after.one_step / np.sqrt(after.variance))), strict=True)
@@ -103,7 +104,9 @@ def verdict_of(
         "candidates_tried": search.tried,
         "seconds": round(seconds, 2),
     }
-    return found | {"summary": sentence(found, before, after, measured)}
+    grows = found["error"]["grows"]
+    warning = f" With it the test error of {' and of '.join(grows)} grows." if grows else ""
+    return found | {"summary": sentence(found, before, after, measured) + warning}
 
 
 def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
