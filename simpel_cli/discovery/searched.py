@@ -150,7 +150,7 @@ class _Ground(NamedTuple):
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
-    """Clean the measurements and search; once more with wider ranges where they pay, and calibrate for the use that is named."""
+    """Clean the measurements and search; once more with wider ranges where they pay; calibrate for the use that is named."""
     effects: list[Expression] = study.declared.groups["effect"]
     ground = _ground(study, len(effects), terminal)
     declared, gained = ground.model, 0.0

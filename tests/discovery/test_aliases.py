@@ -1,6 +1,7 @@
 """Two names of one function: told by the model, not by a list."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,10 @@ import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.verdict.aliases import are_aliases
+from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.filtering.likelihood.fit import Fitter, Optimum
 from simpel_cli.filtering.setup import setup
-from simulators.effects import Expression
+from simulators.effects import Expression, Scales
 from simulators.model import Declared
 
 EFFECTS = [
@@ -57,3 +58,25 @@ def test_an_offset_is_a_load_where_the_input_enters_with_a_constant_gain(gain: s
     assert are_aliases(search, load[1], load, offset) is same
     assert not are_aliases(search, load[1], load, drag)
     assert are_aliases(search, load[1], load, fitted(search, "load", 0.2))
+
+
+@pytest.mark.parametrize(("measured", "inputs", "same"), [("s", "u", True), ("sv", "u", False), ("s", "uw", False)])
+def test_one_late_input_is_one_late_sensor(measured: str, inputs: str, same: bool) -> None:
+    """Whatever the evidence says, which differs by what is assumed of the time before the first row."""
+    search: Any = searched("b")
+    model = search.plan.augmented.model
+    model = replace(model, inputs=tuple(model.inputs[0]._replace(name=name) for name in inputs))
+    late = {"range": [0, 0.3], "unit": "s"}
+    terms = [
+        term
+        for kind, place in (("delay", "input"), ("sensor_delay", "measured"), ("lag", "input"))
+        for term in Expression(kind, acts_on=place, operator=kind, parameters={"d": late}).attach(
+            model, Scales(dict.fromkeys("svuw", 1.0), dict.fromkeys("sv", 1.0), 0.1), tuple(measured)
+        )
+    ]
+    augmented = search.plan.augmented._replace(model=model, measured=tuple(measured))
+    search.plan, search.terms = search.plan._replace(augmented=augmented), terms
+    first, second, lag = (next(t for t in terms if t.kind == k) for k in ("delay", "sensor_delay", "lag"))
+    assert of_structure(search, first) == ([second] if same else [])
+    assert of_structure(search, second) == ([first] if same else [])
+    assert of_structure(search, lag) == []

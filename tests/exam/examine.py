@@ -32,7 +32,8 @@ def examine(drawn: Set, out: Path, tuned: Mapping[str, Sequence[Any]] | None = N
         "strength": min((e["strength"] for e in truth["effects"]), default=0.0),
         "wall": answer.wall, "memory_mb": _memory(), "message": answer.error,
     }  # fmt: skip
-    row |= rivals(folder, truth, tuned or {})
+    if not truth.get("nuisances"):  # the rivals take whole rows only
+        row |= rivals(folder, truth, tuned or {})
     if answer.error:
         return row | {"outcome": score.ERROR}
     return row | _scored(truth, folder)

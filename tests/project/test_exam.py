@@ -28,6 +28,7 @@ from tests.exam.write import write
 
 EXAM = Path(__file__).parents[1] / "exam"
 GENERATOR = (
+    "nuisances",
     "plants",
     "formulas",
     "planted",

@@ -1,4 +1,4 @@
-"""Effects that are the same function in a given model, so that no data can distinguish them.
+"""Effects that are the same in a given model, so that no data can distinguish them.
 
 An offset of a motor's voltage and a constant load are the same force if the voltage enters with a constant gain, and differ
 otherwise: this depends on the model.
@@ -7,10 +7,25 @@ otherwise: this depends on the model.
 import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
-from simulators.effects.term import OPERATORS, SENSOR
+from simulators.effects import Term
+from simulators.effects.term import DELAY, OPERATORS, SENSOR, SENSOR_DELAY
 
 POINTS = 64
 SAME = 1e-6  # of the larger function
+
+
+def of_structure(search: Search, term: Term) -> list[Term]:
+    """Return the terms that the structure of the model makes the same as a delay, whatever the evidence says.
+
+    Where one input drives the system and one sensor sees it, a late input is a late sensor: only what lies before the first
+    row tells them apart, and of that nothing was recorded.
+    """
+    model = search.plan.augmented.model
+    driven = [q.name for q in model.inputs if q.name not in model.covariates]
+    if term.kind not in (DELAY, SENSOR_DELAY) or len(driven) != 1 or len(search.plan.augmented.measured) != 1:
+        return []
+    other = SENSOR_DELAY if term.kind == DELAY else DELAY
+    return [t for t in search.terms if t.kind == other]
 
 
 def are_aliases(search: Search, chosen: Trial, first: tuple[int, Trial], second: tuple[int, Trial]) -> bool:

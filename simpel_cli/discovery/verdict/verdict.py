@@ -8,7 +8,7 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.held_out_gate import Gate, errors_of, growing
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial, asked
-from simpel_cli.discovery.verdict.aliases import are_aliases
+from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
 from simpel_cli.discovery.verdict.share import explained
@@ -66,6 +66,7 @@ def verdict_of(
         )
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
     interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
+    grows = growing(errors_of(before), errors_of(after), measured, windows.episode)
     found = {
         "verdict": kind,
         "summary": "",
@@ -80,7 +81,7 @@ def verdict_of(
             "before": results(before, measured, rows),
             "after": results(after, measured, rows),
             "ci95_of_reduction": {n: [float(v) for v in interval[:, j]] for j, n in enumerate(measured)},
-            "grows": list(growing(errors_of(before), errors_of(after), measured, windows.episode)),
+            "grows": list(grows),
             "horizon_steps": horizon,
             "surprise": dict(
                 zip(measured, (float(v) for v in rmse(after.one_step / np.sqrt(after.variance))), strict=True)
@@ -104,7 +105,6 @@ def verdict_of(
         "candidates_tried": search.tried,
         "seconds": round(seconds, 2),
     }
-    grows = found["error"]["grows"]
     warning = f" With it the test error of {' and of '.join(grows)} grows." if grows else ""
     return found | {"summary": sentence(found, before, after, measured) + warning}
 
@@ -142,11 +142,14 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
     others = [(search.terms[t.terms[-1]], t) for t in selection.classes[i]]
     own = (selection.chosen.terms[i], selection.chosen)
     alike = {key_of(other) for other, t in others if are_aliases(search, selection.chosen, own, (t.terms[-1], t))}
-    same = [other.effect for other, _ in others if key_of(other) in alike and other.effect != term.effect]
+    structural = of_structure(search, term)
+    alike |= {key_of(t) for t in structural}
+    every = {key_of(t): t for t in (*(t for t, _ in others), *structural)}
     members = [{"name": term.effect, "acts_on": term.acts_on, "same": True}] + [
-        {"name": t.effect, "acts_on": t.acts_on, "same": key_of(t) in alike or t.effect in term.same_as}
-        for t, _ in others
+        {"name": t.effect, "acts_on": t.acts_on, "same": key in alike or t.effect in term.same_as}
+        for key, t in every.items()
     ]
+    same = [t.effect for key, t in every.items() if key in alike and t.effect != term.effect]
     places = {m["name"]: m["acts_on"] for m in members[::-1]}
     before = noise_of(search, selection.path[0])[1]  # with groups, where parameters differ
     after = noise_of(search, selection.chosen)[1]
