@@ -80,7 +80,8 @@ def one(drawn: Set, out: Path, tuned: Mapping[str, Sequence[Any]]) -> dict[str, 
 def lost(drawn: Set, out: Path, message: str) -> dict[str, Any]:
     """Keep the row of a set whose process failed outside the tool's own errors."""
     row = {n: v for n, v in drawn._asdict().items() if n not in ("planted", "strength", "seed", "nuisances")} | {
-        "planted": "+".join(drawn.planted), "nuisances": "+".join(drawn.nuisances), "outcome": "error", "message": message, "wall": None,
+        "planted": "+".join(drawn.planted), "nuisances": "+".join(drawn.nuisances),
+        "outcome": "error", "message": message, "wall": None,
     }  # fmt: skip
     keep(out, row)
     return row
