@@ -12,6 +12,7 @@ from test_ranges import searched as measured_search
 
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.held_out_gate import (
+    AHEAD,
     LEAST_BLOCKS,
     LEAST_OF_BLOCK,
     RUNAWAY,
@@ -26,6 +27,9 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
 from simulators.effects import Expression
+
+
+FREE = AHEAD["free"]
 
 
 @pytest.mark.parametrize(
@@ -44,12 +48,18 @@ def test_an_error_that_grows_in_one_channel_is_harm(factors: tuple[float, float]
     assert growing(*errors, ("a", "b"), np.arange(8)) == grows
 
 
+@pytest.mark.parametrize(("factor", "grows"), [(1.05, ()), (1.2, ("a one row ahead",))])
+def test_one_row_ahead_a_little_may_be_lost(factor: float, grows: tuple[str, ...]) -> None:
+    before = np.random.default_rng(0).normal(size=(8, 50, 1))
+    assert growing({AHEAD["one_step"]: before}, {AHEAD["one_step"]: factor * before}, ("a",), np.arange(8)) == grows
+
+
 def test_noise_is_no_harm() -> None:
     """Twenty effects that change nothing, three horizons, four channels, eight episodes."""
     random = np.random.default_rng(0)
     said = 0
     for _ in range(20):
-        draw = [{words: random.normal(size=(8, 50, 4)) for words in "xyz"} for _ in range(2)]
+        draw = [{words: random.normal(size=(8, 50, 4)) for words in AHEAD.values()} for _ in range(2)]
         said += bool(growing(*draw, "abcd", np.arange(8)))
     assert said <= 2
 
@@ -58,8 +68,8 @@ def test_a_channel_without_errors_says_nothing() -> None:
     before = np.random.default_rng(0).normal(size=(8, 50, 2))
     before[..., 1] = np.nan
     nothing = np.full_like(before, np.nan)
-    assert growing({"x": before}, {"x": 2 * before}, "ab", np.arange(8)) == ("a x",)
-    assert not growing({"x": nothing}, {"x": nothing}, "ab", np.arange(8))
+    assert growing({FREE: before}, {FREE: 2 * before}, "ab", np.arange(8)) == ("a in free run",)
+    assert not growing({FREE: nothing}, {FREE: nothing}, "ab", np.arange(8))
 
 
 def windows_of(episode: Sequence[int], first: int) -> Windows:

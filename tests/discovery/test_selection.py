@@ -116,7 +116,7 @@ class Table:
             on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(hypothesis.free)}
             value = float(self.of(frozenset(self.name(i) for i in on)))
             d, eye = len(hypothesis.free), np.eye(len(hypothesis.free))
-            slope = np.full(d, 100.0)  # everything promises the same, and enough to be fitted
+            slope = np.full(d, 1000.0)  # everything promises the same, and enough to be fitted
             found.append(
                 Optimum(hypothesis.z, hypothesis.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True)
             )

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, TIE, Search, Stage, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, SHARE, TIE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects import Term
+from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
 MOST_EFFECTS = 8
 MOST_MERGERS = 2
@@ -199,10 +200,15 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
     no such term.
     """
     most, found = _worth(chosen), None
-    for pair in combinations(chosen.terms, 2):
-        less = tuple(t for t in chosen.terms if t not in pair)
-        rest = search.best(less, search.fitter(search.less(chosen, less)))
-        stage = search.add(rest, [t for t in search.candidates(rest.terms) if t not in pair])
+    pairs = list(combinations(chosen.terms, 2))
+    sets = [tuple(t for t in chosen.terms if t not in pair) for pair in pairs]
+    fits = search.fitter([hypothesis for less in sets for hypothesis in search.less(chosen, less)])
+    for k, (pair, less) in enumerate(zip(pairs, sets, strict=True)):
+        rest = search.best(less, fits[2 * k : 2 * k + 2])
+        promising = _in_place_of(search, chosen, pair, rest)
+        if not promising:
+            continue
+        stage = search.add(rest, promising)
         # with two terms less the noise may have settled elsewhere: the best begin once more with that of the chosen model
         z = search.off(chosen.optimum.z, pair)
         again = [t for t in stage.trials if not _nameless(search, t)][:MOST_AGAIN]
@@ -219,6 +225,21 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
                 others = [t for t in stage.trials if t is not trial]
                 most, found = worth, stage._replace(trials=(trial, *others))
     return found
+
+
+def _in_place_of(search: Search, chosen: Trial, pair: tuple[int, ...], rest: Trial) -> list[int]:
+    """Return the terms that may do as well as a pair of effects: they promise a share of what is needed beside the rest.
+
+    Of a late signal a slope cannot tell. It can only stand for effects of which one is of a signal, too.
+    """
+    candidates = [t for t in search.candidates(rest.terms) if t not in pair]
+    signals = any(search.terms[t].kind in (*OPERATORS, SENSOR, INPUT) for t in pair)
+    needed = SHARE * (chosen.optimum.log_evidence - asked(len(chosen.terms)) - rest.optimum.log_evidence)
+    starts = search.starts(rest, candidates)
+    return list(dict.fromkeys(
+        t for (t, _), score in zip(starts, search.promises(rest, starts), strict=True)
+        if score.gain > needed and (np.isfinite(score.gain) or signals or search.terms[t].kind not in OPERATORS)
+    ))  # fmt: skip
 
 
 def _path(search: Search, chosen: Trial) -> tuple[Trial, ...]:
