@@ -28,7 +28,6 @@ from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
 from simulators.effects import Expression
 
-
 FREE = AHEAD["free"]
 
 
