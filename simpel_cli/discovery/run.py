@@ -110,8 +110,9 @@ def _verdict(
     searched: Searched, outside: list[Beyond], before: Assessment, after: Assessment, began: float
 ) -> dict[str, Any]:
     """Return what `verdict.json` holds of the search itself."""
-    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked, _ = searched
-    left = remainder_of(search, selection, disturbance, assessor(selection.chosen.optimum.z, search.plan.windows))
+    search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked, *_ = searched
+    learnt = assessor(selection.chosen.optimum.z, search.plan.windows)
+    left = remainder_of(search, selection, disturbance, learnt, searched.drift)
     seconds = time.perf_counter() - began
     found = verdict_of(
         search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
@@ -120,6 +121,7 @@ def _verdict(
     found["degrees_of_freedom"] = nu
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
+    found["drift"] = searched.drift and searched.drift._asdict()
     found["outside_ranges"] = [b._asdict() for b in outside]
     first = [f"{name} by {by}" for name, by in per_of(asked).items()]
     first += [f"{b.name} outside its range" for b in outside]

@@ -18,11 +18,12 @@ from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
+from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for
 from simpel_cli.dynamics.transition import encoding_of
@@ -53,6 +54,7 @@ class Searched(NamedTuple):
         between_rows: input -> what it does between rows, where neither simulator nor data say.
         degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
         groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
+        drift: a parameter that is no constant; None: there is none.
         wider: nats of evidence of ranges wider than those that were declared.
     """
 
@@ -67,6 +69,7 @@ class Searched(NamedTuple):
     degrees_of_freedom: dict[str, float]
     groupings: list[Grouping]
     wider: float = 0.0
+    drift: Drift | None = None
 
 
 def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
@@ -307,7 +310,18 @@ def _with(
     levels = NoiseProfile(search, assessor, selection.chosen)
     attach_said = partial(attach, saying(model, between_rows))
     selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
+    alone = drifting(NoiseProfile(search, assessor, selection.base)) if selection.chosen.terms else None
+    if stands_for(alone, selection.base, selection.chosen):
+        terminal.line("a parameter that is no constant explains as much as these effects", "search")
+        selection, gates = cut(search, selection, [])._replace(remainder=None), []
+        levels = NoiseProfile(search, assessor, selection.chosen)
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
+    drift = drifting(levels)
+    known = max(selection.remainder[1] if selection.remainder else 0.0, disturbance.gain if disturbance else 0.0)
+    if drift is not None and drift.gain < known - TIE:
+        drift = None
+    if drift is not None:
+        terminal.line(f"{drift.words} +{drift.gain:.0f}", "search")
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
     left = bool(selection.remainder or disturbance)
@@ -316,5 +330,5 @@ def _with(
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(
         search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
-        asked,
+        asked, drift=drift,
     )  # fmt: skip

@@ -113,7 +113,8 @@ def named(nuisances: tuple[str, ...], system: System, found: Mapping[str, Any]) 
     """Return whether the tool says of each nuisance what it is; those that no tool has to name are left out."""
     claimed = {(m["name"], m["acts_on"]) for e in found["effects"] for m in e["class_members"]}
     bad = {c["check"] for c in found["data_checks"] if not c["ok"]}
-    differing = any(g["parameter"] and g["pays"] for g in found["grouping"])
+    drift = found.get("drift") or {"how": ""}
+    differing = any(g["parameter"] and g["pays"] for g in found["grouping"]) or "to episode" in drift["how"]
     left = found["remainder"] or {"depends_on": [], "description": ""}
     speeds = {(n, p) for p in system.velocity for n in ("sensor_delay", "sensor_lag")}
     says = {
@@ -122,6 +123,6 @@ def named(nuisances: tuple[str, ...], system: System, found: Mapping[str, Any]) 
         LATE: bool(claimed & speeds) or bool(bad & {"kinematics"}),
         FILTERED: bool(claimed & speeds) or bool(bad & {"kinematics", "derived"}),
         DIFFERING: differing,
-        DRIFT: "time" in left["depends_on"] or bool(found.get("drift")),
+        DRIFT: "time" in left["depends_on"] or "over an episode" in drift["how"],
     }
     return {n: says[n] for n in nuisances if n in says}

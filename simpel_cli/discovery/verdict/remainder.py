@@ -7,6 +7,7 @@ import numpy as np
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
+from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
 from simpel_cli.filtering.errors_ahead import Assessment
 from simpel_cli.filtering.likelihood.whiteness import memory
 from simulators.effects.expression import per
@@ -15,7 +16,11 @@ ALIKE = 0.3  # of an input's variance, at the period of a disturbance
 
 
 def remainder_of(
-    search: Search, selection: Selection, disturbance: Disturbance | None, learnt: Assessment
+    search: Search,
+    selection: Selection,
+    disturbance: Disturbance | None,
+    learnt: Assessment,
+    drift: Drift | None = None,
 ) -> dict[str, Any] | None:
     """Return `remainder` of `verdict.json`; None if no model error is found.
 
@@ -24,7 +29,10 @@ def remainder_of(
         selection: what it chose, and an unknown function that improves it further.
         disturbance: a force that depends on time alone; None: there is none.
         learnt: the corrected model on the windows that it was fitted to.
+        drift: a parameter that is no constant, which explains more than either; None: there is none.
     """
+    if drift is not None:
+        return _of_parameter(search, selection.chosen, drift)
     found = _function(search, selection) or (disturbance and _of_time(search, disturbance))
     return found or _followed(search, selection.chosen, learnt)
 
@@ -46,6 +54,17 @@ def dependence(remainder: dict[str, Any]) -> str:
     """Return what the remaining model error depends on, in words."""
     period = remainder.get("period")
     return ", ".join(remainder["depends_on"]) + (f", with a period of about {period:.3g} s" if period else "")
+
+
+def _of_parameter(search: Search, chosen: Trial, drift: Drift) -> dict[str, Any]:
+    return {
+        "acts_on": drift.acts_on,
+        "depends_on": ["time" if drift.how == OVER else "episode"],
+        "rms": noise_of(search, chosen)[1] / np.sqrt(search.plan.augmented.model.dt),
+        "unit": _unit(search, drift.acts_on),
+        "log_evidence_gain": drift.gain,
+        "description": f"a parameter is no constant: {drift.words}",
+    }
 
 
 def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
