@@ -91,7 +91,7 @@ def drifting(levels: NoiseProfile) -> Drift | None:
                     gain, weights = _earned(level, columns * span)
                     size = float(weights[0] * span if how == OVER else np.std(weights) * span)
                     acts_on = model.states[row].name
-                    found.append(Drift(q.name, how, size, q.unit, acts_on, level.reached + gain - base))
+                    found.append(Drift(q.name, how, size, q.unit, acts_on, float(level.reached + gain - base)))
     best = max(found, key=lambda one: one.gain, default=None)
     return best if best is not None and best.gain > CERTAIN else None
 
@@ -105,8 +105,8 @@ def _earned(level: Level, columns: np.ndarray) -> tuple[float, np.ndarray]:
     best = int(np.argmax(gains))
     if not np.isfinite(gains[best]):
         return -np.inf, np.zeros(len(pull))
-    weights = np.linalg.solve(matrix + np.eye(len(pull)) / SIZES[best] ** 2, pull)
-    return float(gains[best]), weights
+    # columns say what a force does to the innovations of a model that has it: this one lacks it
+    return float(gains[best]), -np.linalg.solve(matrix + np.eye(len(pull)) / SIZES[best] ** 2, pull)
 
 
 def _progress(windows: Windows) -> np.ndarray:
