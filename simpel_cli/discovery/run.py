@@ -22,6 +22,8 @@ from simpel_cli.discovery.verdict.beyond import Beyond, beyond
 from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges
 from simpel_cli.discovery.verdict.beyond import written as ranged
 from simpel_cli.discovery.verdict.corrected import corrected
+from simpel_cli.discovery.verdict.determined import left_open
+from simpel_cli.discovery.verdict.determined import sentence_of as of_open
 from simpel_cli.discovery.verdict.evidence import evidence_tables
 from simpel_cli.discovery.verdict.groups import sentence_of as of_groups
 from simpel_cli.discovery.verdict.remainder import remainder_of
@@ -122,6 +124,7 @@ def _verdict(
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
     found["drift"] = searched.drift and searched.drift._asdict()
+    found["not_determined"] = [o._asdict() | {"words": o.words} for o in left_open(search, selection.chosen)]
     found["outside_ranges"] = [b._asdict() for b in outside]
     first = [f"{name} by {by}" for name, by in per_of(asked).items()]
     first += [f"{b.name} outside its range" for b in outside]
@@ -135,6 +138,7 @@ def _verdict(
         of_ranges(outside)
         + of_grouping(asked)
         + of_groups(found["groups"])
+        + of_open(found["not_determined"])
         + sentence_of(between_rows)
         + sentence_of_tails(nu)
         + caveats(found)
