@@ -94,7 +94,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     found = _verdict(searched, outside, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
     found["summary"] += sentence_of_latency(latencies)
-    if found["verdict"] == AMBIGUOUS:
+    if found["verdict"] == AMBIGUOUS and not search.budget.over("the next experiment"):
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
     declared = _with_linear_inputs(declared, searched.between_rows)
@@ -123,6 +123,7 @@ def _verdict(
     found["degrees_of_freedom"] = nu
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
     found["steps"] = steps_of(search, selection, assessor, windows)
+    found["left_out"] = search.budget.left_out
     found["drift"] = searched.drift and searched.drift._asdict()
     found["not_determined"] = [o._asdict() | {"words": o.words} for o in left_open(search, selection.chosen)]
     found["outside_ranges"] = [b._asdict() for b in outside]
@@ -142,6 +143,7 @@ def _verdict(
         + sentence_of(between_rows)
         + sentence_of_tails(nu)
         + caveats(found)
+        + search.budget.sentence
     )
     return found
 

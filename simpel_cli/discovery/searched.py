@@ -9,6 +9,7 @@ from typing import NamedTuple
 from simpel_cli.data import Recording, read
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
+from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.grouping import in_words as grouping_in_words
@@ -25,7 +26,7 @@ from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for
+from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, suited
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
@@ -134,6 +135,7 @@ class _Ground(NamedTuple):
         options: of the search.
         declared_noise: channels whose noise the user declared.
         terminal: takes lines.
+        budget: time that it may take.
         wider: how often ranges of the model or of effects were found too narrow.
     """
 
@@ -142,6 +144,7 @@ class _Ground(NamedTuple):
     options: Discovery
     declared_noise: tuple[str, ...]
     terminal: Terminal
+    budget: Budget
     wider: int = 0
 
     def attach(self, effects: list[Expression]) -> partial[Setup]:
@@ -179,12 +182,14 @@ def _for_use(ground: _Ground, found: Searched, terminal: Terminal) -> Searched:
     plan, recording = search.plan, ground.clean.recording
     whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
 
-    def suited(trial: Trial) -> Trial:
-        return calibrated_for(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
+    def of_use(trial: Trial) -> Trial:
+        return suited(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
-    path = tuple(suited(t) for t in selection.path)
-    terminal.line(f"calibrated for {use if use == FREE_RUN else f'{use:g} s ahead'} (discovery.for)", "search")
-    return found._replace(selection=selection._replace(base=suited(selection.base), chosen=path[-1], path=path))
+    path = tuple(of_use(t) for t in selection.path)
+    what = use if use == FREE_RUN else f"{use:g} s ahead"
+    moved = path[-1] is not selection.path[-1]
+    terminal.line(f"calibrated for {what}{'' if moved else ': what the innovations say does as well'}", "search")
+    return found._replace(selection=selection._replace(base=of_use(selection.base), chosen=path[-1], path=path))
 
 
 def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched | Wider:
@@ -225,7 +230,7 @@ def _ground(study: Study, effects: int, terminal: Terminal) -> _Ground:
     rows = sum(len(e.time) for e in clean.recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    return _Ground(model, clean, options, declared_noise, terminal)
+    return _Ground(model, clean, options, declared_noise, terminal, Budget(seconds_of(options.budget)))
 
 
 def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched | Wider:
@@ -278,14 +283,16 @@ def _with(
     def begun_in(plan: Setup) -> tuple[Assessor, Calibrated]:
         fitter = fitter_of(plan, options.lanes, options.room + members(plan))
         assessor = Assessor(plan, options.horizon)
-        return assessor, calibrated(plan, fitter, assessor, ground.clean, terminal)
+        found = calibrated(plan, fitter, assessor, ground.clean, terminal)
+        found.search.budget = ground.budget
+        return assessor, found
 
     assessor, found = begun_in(plan)
     if (ends := wider(found, found.base)) is not None:
         return ends
     selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     said, chosen = words_of(between_rows), selection.chosen
-    if said and chosen.terms:
+    if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
     if words_of(between_rows) != said:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
@@ -294,22 +301,25 @@ def _with(
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     if (ends := wider(found, selection.chosen)) is not None:
         return ends
-    if ask and selection.chosen.terms:
+    if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
             return beside
         own = beside  # what it is worth beside the effects
     # beside what is left unexplained, no data tell whether tails are heavy
-    heavy = None if selection.remainder else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
+    skip = bool(selection.remainder) or ground.budget.over("heavy tails of the noise")
+    heavy = None if skip else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
     if heavy is not None:
         found = heavy
+        found.search.budget = ground.budget
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     search, windows = found.search, found.test
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)
     attach_said = partial(attach, saying(model, between_rows))
-    selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
+    if not ground.budget.over("functions of two arguments"):
+        selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     alone = drifting(NoiseProfile(search, assessor, selection.base)) if selection.chosen.terms else None
     if stands_for(alone, selection.base, selection.chosen):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
@@ -325,7 +335,9 @@ def _with(
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
     left = bool(selection.remainder or disturbance)
-    asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)
+    asked = own
+    if not (model.groups and ground.budget.over("effects per group")):
+        asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)
     recording = ground.clean.recording
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(

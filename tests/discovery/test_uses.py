@@ -8,7 +8,7 @@ from test_ranges import measured, searched
 
 from simpel_cli.config.build import build
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, correlation_time
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, correlation_time, suited
 from simpel_cli.errors import ConfigError
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
 from simpel_cli.filtering.setup import test_windows as held_out  # pytest would take it for a test
@@ -66,3 +66,27 @@ def test_a_wrong_use_is_told_what_is_allowed(given: Any) -> None:
         build({"for": given}, "discovery")
     with pytest.raises(ConfigError, match=r"discovery\.fo: .*discovery\.for\?"):
         build({"fo": given}, "discovery")
+
+
+def test_what_suits_large_motions_alone_is_not_taken() -> None:
+    """One episode of four has a cubic drag that dwarfs the rest: what fits it simulates the others worse."""
+    recording = measured(1.2, k=0.05)
+    first = recording.train[0]
+    far = first._replace(states=first.states * np.array([1.0, 1.0]) - 0.4 * np.maximum(first.time[:, None] - 1, 0) ** 2)
+    search = searched(recording._replace(train=(far, *recording.train[1:], *recording.test)), [])
+    base, assessor = search.base(), Assessor(search.plan, 10)
+    windows = held_out(search.plan, (far, *recording.train[1:], *recording.test), ())
+    others = held_out(search.plan, (*recording.train[1:], *recording.test), ())
+    taken = suited(search, assessor, base, windows, FREE_RUN)
+    bent = calibrated_for(search, assessor, base, windows, FREE_RUN)
+    errors = {name: np.prod(rmse(assessor(t.optimum.z, others).free)) for name, t in (("taken", taken), ("bent", bent))}
+    assert errors["taken"] <= errors["bent"]
+
+
+def test_a_model_that_simulates_better_on_unseen_episodes_is_taken() -> None:
+    recording = measured(1.2, k=0.3)
+    search = searched(recording, [])
+    base, assessor = search.base(), Assessor(search.plan, 10)
+    windows = held_out(search.plan, recording.train, ())
+    assert suited(search, assessor, base, windows, FREE_RUN) is not base
+    assert suited(search, assessor, base, windows, ONE_STEP) is base

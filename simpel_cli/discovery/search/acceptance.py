@@ -25,7 +25,10 @@ def accepted(
     selection = select(search, base, options.beginnings)
     for attempt in range(MOST_SEARCHES):
         selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
-        if not harmful or attempt == MOST_SEARCHES - 1:  # what is returned has been judged
+        last = attempt == MOST_SEARCHES - 1 or (
+            harmful and search.budget.over("what an effect that did harm stood for")
+        )
+        if not harmful or last:  # what is returned has been judged
             break
         left, selection = selection, further(search, selection)
         if selection.chosen.terms == left.chosen.terms:

@@ -64,7 +64,8 @@ def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNIN
     """
     base = base or search.base()
     grown = _grow(search, (base,))
-    if beginnings and (len(grown.path) > 2 or grown.remainder):
+    several = len(grown.path) > 2 or grown.remainder
+    if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(g.path[-1]))
     return _settled(search, grown)
 
@@ -130,6 +131,8 @@ def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
     remainder = None
     while True:
         current = path[-1]
+        if current.terms and search.budget.over("effects beside those found"):
+            return _Grown(path, tuple(stages), None)
         stage = search.add(current, search.candidates(current.terms))
         trials = stage.trials
         if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
@@ -201,6 +204,8 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
     """
     most, found = _worth(chosen), None
     pairs = list(combinations(chosen.terms, 2))
+    if pairs and search.budget.over("one effect in place of two"):
+        return None
     sets = [tuple(t for t in chosen.terms if t not in pair) for pair in pairs]
     fits = search.fitter([hypothesis for less in sets for hypothesis in search.less(chosen, less)])
     for k, (pair, less) in enumerate(zip(pairs, sets, strict=True)):

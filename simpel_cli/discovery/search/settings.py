@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from simpel_cli.discovery.search.budget import seconds_of
 from simpel_cli.discovery.search.selection import BEGINNINGS
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP
 from simpel_cli.errors import ConfigError, check_at_least_one
@@ -24,6 +25,8 @@ class Discovery:
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
         for_: what the model is for: `free_run`, how many seconds ahead (0.5), or `one_step`. The last calibration, of the
             simulator and of the corrected one, is for it; null: one_step.
+        budget: how long the search may take, s (60, `60s`, `2min`): what is worth most comes first, and the verdict says what
+            was left out. What has begun is ended, and the report comes on top. Null: as long as it takes.
     """
 
     horizon: int = 20
@@ -34,6 +37,7 @@ class Discovery:
     pairs: bool = False
     beginnings: int = BEGINNINGS
     for_: str | float | None = None
+    budget: str | float | None = None
 
     def __post_init__(self) -> None:
         if self.pairs and self.room < PAIR:
@@ -47,6 +51,12 @@ class Discovery:
             )
         if isinstance(self.for_, float) and not self.for_ > 0:
             raise ConfigError(f"discovery.for: got {self.for_}; seconds ahead must be above 0.")
+        try:
+            seconds_of(self.budget)
+        except ValueError:
+            raise ConfigError(
+                f"discovery.budget: got {self.budget!r}; give a time above 0, in seconds or as 60s, 2min, 1h."
+            ) from None
         if self.beginnings < 0:
             raise ConfigError(f"discovery.beginnings: got {self.beginnings}; it must be at least 0.")
         if self.substeps is not None and self.substeps < 1:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
@@ -92,6 +93,7 @@ class Search:
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
+        self.budget = Budget()
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
         self.asked: dict[tuple[Any, ...], Stage] = {}  # what was added to what already

@@ -21,14 +21,15 @@ from scipy.optimize import least_squares
 
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
-from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 
 ONE_STEP, FREE_RUN = "one_step", "free_run"
 NUDGE = 1e-4  # of a range, for differences
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 30  # evaluations
 MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
+MOST_FOLDS = 5
 CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
 
 Errors = Callable[[np.ndarray], np.ndarray]  # (models, n) -> (models, W, T, ny)
@@ -81,6 +82,33 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     moved = z.copy()
     moved[rows] = found.x
     return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
+
+
+def suited(search: Search, assessor: Assessor, trial: Trial, windows: Windows, use: str | float) -> Trial:
+    """Return a model with the parameters that suit a use, where they do so on episodes that had no part in them, too.
+
+    A model that is wrong where its errors are largest is bent to these, and may be worse everywhere else: what the innovations
+    say stays then. Fewer than three episodes cannot tell.
+
+    Args: as of `calibrated_for`.
+    """
+    groups = np.unique(windows.episode)
+    if use == ONE_STEP or len(groups) < LEAST_EPISODES:
+        return calibrated_for(search, assessor, trial, windows, use)
+    folds = np.array_split(np.random.default_rng(0).permutation(groups), min(MOST_FOLDS, len(groups)))
+    episode, dt = search.plan.windows.episode, search.plan.augmented.model.dt
+    weights = [np.where(np.isin(episode, fold), 0.0, 1.0) for fold in folds]
+    fits = search.fitter([Hypothesis(trial.optimum.z, trial.optimum.free, weight) for weight in weights])
+    squares = np.zeros((2, windows.y.shape[2]))
+    for fold, optimum in zip(folds, fits, strict=True):
+        out = np.isin(windows.episode, fold)
+        rest, held = (Windows(*(a[part] for a in windows)) for part in (~out, out))
+        own = Trial(trial.terms, optimum)
+        both = np.stack([t.optimum.z for t in (own, calibrated_for(search, assessor, own, rest, use))])
+        squares += np.nansum(_errors_of(assessor, held, use, dt)(both) ** 2, axis=(1, 2))
+    seen = (squares > 0).all(axis=0)
+    better = bool(np.log(squares[1, seen] / squares[0, seen]).sum() < 0)
+    return calibrated_for(search, assessor, trial, windows, use) if better else trial
 
 
 def correlation_time(errors: np.ndarray) -> float:
