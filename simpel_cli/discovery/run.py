@@ -16,7 +16,7 @@ from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentenc
 from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
-from simpel_cli.discovery.search.own_parameters import declared_in, in_common, per_of, written
+from simpel_cli.discovery.search.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.searched import Searched, latencies_of, search_of, with_latencies
 from simpel_cli.discovery.verdict.beyond import Beyond, beyond
 from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges
@@ -86,9 +86,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     searched = search_of(study, terminal)
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     assert isinstance(study.system.source, Model)
-    if per := per_of(searched.groupings):  # before is the simulator as it was declared
-        selection = selection._replace(base=in_common(search, selection.base, per))
-        searched = searched._replace(selection=selection)
+    per = per_of(searched.groupings)
     before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
     outside = beyond(study.system.source, search, selection.chosen, searched.wider)
     found = _verdict(searched, outside, before, after, began)

@@ -16,8 +16,8 @@ from simpel_cli.discovery.search.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
-from simpel_cli.discovery.search.own_parameters import own_parameters, per_of, with_own
-from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened, within
+from simpel_cli.discovery.search.own_parameters import in_common, own_parameters, per_of, with_own
+from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
@@ -56,7 +56,7 @@ class Searched(NamedTuple):
         degrees_of_freedom: measured channel -> nu of Student's t, of those whose noise has heavy tails.
         groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
         drift: a parameter that is no constant; None: there is none.
-        wider: nats of evidence of ranges wider than those that were declared.
+        wider: nats by which the evidence of the chosen model is ahead of that within the ranges that were declared.
     """
 
     search: Search
@@ -159,37 +159,51 @@ def search_of(study: Study, terminal: Terminal) -> Searched:
     """Clean the measurements and search; once more with wider ranges where they pay; calibrate for the use that is named."""
     effects: list[Expression] = study.declared.groups["effect"]
     ground = _ground(study, len(effects), terminal)
-    declared, gained = ground.model, 0.0
+    declared = ground.model
     found = _search_in_groups(ground, effects)
     while isinstance(found, Wider):
         terminal.line(ranges_in_words(found), "ranges")
-        gained += found.gain
         model, effects = widened(ground.model, effects, found.ranges)
         ground = ground._replace(model=model, wider=ground.wider + 1)
         found = _search_in_groups(ground, effects)
-    before = {q.name: (q.low, q.high) for q in declared.params}
-    base = within(found.search, found.selection.base, before)  # before: the simulator as it was declared
-    selection = found.selection._replace(base=base)
-    return _for_use(ground, found._replace(wider=gained, selection=selection), terminal)
+    return _for_use(ground, found, declared, terminal)
 
 
-def _for_use(ground: _Ground, found: Searched, terminal: Terminal) -> Searched:
-    """Calibrate the models before and after for what they will be used for (`discovery.for`)."""
-    use = ground.options.for_
-    if use in (None, ONE_STEP):
-        return found
-    search, assessor, selection = found.search, found.assessor, found.selection
+def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Terminal) -> Searched:
+    """Calibrate the models before and after for what they will be used for (`discovery.for`).
+
+    Before is the simulator as it was declared: one value for all groups, in the ranges that it gives.
+    """
+    use = ground.options.for_ or ONE_STEP
+    search, selection = found.search, found.selection
     plan, recording = search.plan, ground.clean.recording
+    base = selection.base
+    if per := per_of(found.groupings):
+        base = in_common(search, base, per)
+    narrow = narrowed(search, {q.name: (q.low, q.high) for q in declared.params})
+    wider = 0.0
+    if narrow is not None:
+        wider = selection.chosen.optimum.log_evidence - within(search, narrow, selection.chosen).optimum.log_evidence
+        base = within(search, narrow, base)
     whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
 
-    def of_use(trial: Trial) -> Trial:
+    def of_use(search: Search, trial: Trial) -> Trial:
+        assessor = Assessor(search.plan, found.assessor.horizon)
         return suited(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
-    path = tuple(of_use(t) for t in selection.path)
+    path, before = selection.path, selection.path[-1]
+    if use != ONE_STEP:
+        base = of_use(narrow or search, base)
+        path = tuple(of_use(search, t) for t in path)
+    base = base if narrow is None else translated(narrow, search, base)
+    selection = selection._replace(base=base, chosen=path[-1], path=path)
+    found = found._replace(wider=wider, selection=selection)
+    if use == ONE_STEP:
+        return found
     what = use if use == FREE_RUN else f"{use:g} s ahead"
-    moved = path[-1] is not selection.path[-1]
+    moved = path[-1] is not before
     terminal.line(f"calibrated for {what}{'' if moved else ': what the innovations say does as well'}", "search")
-    return found._replace(selection=selection._replace(base=of_use(selection.base), chosen=path[-1], path=path))
+    return found
 
 
 def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched | Wider:
@@ -334,7 +348,7 @@ def _with(
         terminal.line(f"{drift.words} +{drift.gain:.0f}", "search")
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
-    left = bool(selection.remainder or disturbance)
+    left = bool(selection.remainder or disturbance or drift)
     asked = own
     if not (model.groups and ground.budget.over("effects per group")):
         asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)

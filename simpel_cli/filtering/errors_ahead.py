@@ -14,6 +14,7 @@ from simpel_cli.filtering.likelihood.track import Filter, Track
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 
+RAN_AWAY = 1e3  # times the other model's error, where a model has none
 SETTLE = 5  # rows after which the filter knows a state that it started without
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -111,6 +112,7 @@ def reduction_interval(
 
     Reference: Efron and Tibshirani (1993), An introduction to the bootstrap, ch. 8.
     """
+    before, after = with_lost(before, after)
     names = np.unique(episode)
     sums = [[np.nansum(e[episode == n] ** 2, axis=(0, 1)) for n in names] for e in (before, after)]
     first, second = (np.stack(s) for s in sums)
@@ -121,6 +123,27 @@ def reduction_interval(
     interval = np.full((2, ratio.shape[1]), np.nan)
     interval[:, measured] = np.nanquantile(ratio[:, measured], [(1 - level) / 2, (1 + level) / 2], axis=0)
     return interval
+
+
+def with_lost(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors of two models in which one that ran away where the other did not is far off, not without an error."""
+    found = []
+    for own, other in ((before, after), (after, before)):
+        known = np.isfinite(other)
+        size = np.sqrt(np.mean(other[known] ** 2)) if known.any() else 0.0
+        found.append(np.where(~np.isfinite(own) & known, RAN_AWAY * size, own))
+    return found[0], found[1]
+
+
+def in_blocks(errors: np.ndarray, count: int) -> np.ndarray:
+    """Cut the windows of errors (W, T, ny) into blocks of rows, (W count, rows, ny): one episode alone has no interval.
+
+    Reference: Kuensch (1989), The jackknife and the bootstrap for general stationary observations.
+    """
+    windows, rows, ny = errors.shape
+    length = -(-rows // count)
+    padded = np.concatenate([errors, np.full((windows, count * length - rows, ny), np.nan)], axis=1)
+    return padded.reshape(windows * count, length, ny)
 
 
 def gain_interval(gain: np.ndarray, random: np.random.Generator, draws: int = 4000) -> tuple[float, float]:

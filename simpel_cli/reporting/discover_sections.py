@@ -275,9 +275,12 @@ def remainder_section(found: Mapping[str, Any]) -> Section:
         return {}
     rms = rest.get("rms", np.nan)
     size = f", with a root mean square of {rms:.3g} {rest['unit']}" if np.isfinite(rms) else ""
+    where = f"The model error in d({rest['acts_on']})/dt depends on {dependence(rest)}"
+    if not rest["depends_on"]:
+        where = rest["description"][0].upper() + rest["description"][1:]
     return {
         "title": "Unexplained model error",
-        "note": f"The model error in d({rest['acts_on']})/dt depends on {dependence(rest)}{size}. No known effect "
+        "note": f"{where}{size}. No known effect "
         "explains it. The figure of the latent force shows its shape. To add an effect of your own, write one YAML file "
         "with an expression (conf/effect/).",
     }

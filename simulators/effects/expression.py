@@ -63,7 +63,8 @@ class Expression:
         units: unit or units of the quantities that it can act on; empty: any.
         generalises: effects that it becomes when some of its parameters are neutral.
         dissipative: it never adds energy (tested).
-        mutual: what it adds to the rate of `x` it takes from that of `other`: one term per pair of states.
+        mutual: what it adds to the rate of `x` it takes from that of `other`: one term per pair of states, in which `x` is the
+            one that the simulator names first.
         widened: unique name of a parameter at a place -> its range there, where a search found that stated too narrow.
     """
 
@@ -151,7 +152,7 @@ class Expression:
             "measured_angle": tuple(n for n in measured if n in angles),
         }
         allowed = (self.units,) if self.units and isinstance(self.units, str) else tuple(self.units)
-        terms = []
+        terms: list[Term] = []
         for place in self.places:
             if place not in members and place not in units:
                 raise ModelError(
@@ -162,7 +163,7 @@ class Expression:
                 if allowed and units[name] not in allowed:
                     continue
                 terms += self._at(name, self.term, model, scales, roles.velocity.get(name), units, place)
-        return terms
+        return list({t.acts_on: t for t in terms[::-1]}.values())[::-1] if self.mutual else terms  # once per pair
 
     def _at(
         self,
@@ -185,8 +186,13 @@ class Expression:
         role = next((r for r in ("other", "around") if r in names), "")
         among = {"other": states, "around": [q.name for q in model.inputs]}.get(role, [])
         others = [n for n in among if n != name and units[n] == units[name]] if role else [""]
-        if self.mutual:  # once per pair
-            others = [n for n in others if states.index(n) > states.index(name)]
+        if self.mutual:
+            if name not in states:
+                raise ModelError(
+                    f"effect.{self.name}.acts_on: {name!r} is no state; a mutual effect is between two states"
+                )
+            dynamic = structure(model).dynamic  # nothing is taken from what a speed says of its position
+            others = [n for n in others if n in dynamic]
         own = {"v": name, "x": name, "u": name, "y": name} | ({"s": position} if position else {})
         size = scales.size
         values = {
@@ -205,8 +211,12 @@ class Expression:
             swap = own | {role: other} | {k.label: k.name for k in parameters}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
             if self.mutual:
-                both = ((name, text), (other, f"-({text})"))
-                found.append(self._term(f"{name}, {other}", kind, "", parameters, model, both))
+                first, second = sorted((name, other), key=states.index)
+                if first != name:  # the same term, whichever of the two was named
+                    parameters = self._parameters(f"{self.name}_{first}_{second}", values, unit_of)
+                    text = _renamed(term, {"x": first, role: second} | {k.label: k.name for k in parameters})
+                both = ((first, text), (second, f"-({text})"))
+                found.append(self._term(f"{first}, {second}", kind, "", parameters, model, both))
             else:
                 found.append(self._term(name, kind, text, parameters, model))
         return found

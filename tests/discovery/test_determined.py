@@ -57,6 +57,15 @@ def test_the_sentence() -> None:
     assert three.words == "k up with m up with l down"
 
 
+def test_where_nothing_is_determined_no_ratio_is() -> None:
+    search = searched({"k": {"range": [2, 4]}, "m": {"range": [1.5, 4]}}, "k/m*u")
+    base = search.base()
+    weak = base._replace(optimum=base.optimum._replace(fisher=np.eye(len(base.optimum.free))))
+    found = left_open(search, weak)
+    assert len(found) == 2
+    assert not any("only" in one.words for one in found)
+
+
 def test_a_fit_that_went_astray_says_nothing() -> None:
     search = searched({"b": {"range": [0.8, 1.8]}}, "b*u")
     base = search.base()

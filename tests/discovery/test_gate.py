@@ -53,6 +53,14 @@ def test_one_row_ahead_a_little_may_be_lost(factor: float, grows: tuple[str, ...
     assert growing({AHEAD["one_step"]: before}, {AHEAD["one_step"]: factor * before}, ("a",), np.arange(8)) == grows
 
 
+def test_a_model_that_runs_away_has_no_small_error() -> None:
+    before = np.random.default_rng(0).normal(size=(8, 50, 1))
+    after = 0.9 * before
+    after[:, 10:] = np.nan
+    assert growing({FREE: before}, {FREE: after}, ("a",), np.arange(8)) == ("a in free run",)
+    assert growing({FREE: after}, {FREE: before}, ("a",), np.arange(8)) == ()
+
+
 def test_noise_is_no_harm() -> None:
     """Twenty effects that change nothing, three horizons, four channels, eight episodes."""
     random = np.random.default_rng(0)
@@ -181,6 +189,14 @@ def test_one_odd_block_decides_nothing_of_the_likelihood() -> None:
     odd[0] = -300.0
     judged = [_judged(_tempered(g), errors, errors, ("y",), np.arange(20), "block") for g in (gains, odd, -odd)]
     assert [j.passed for j in judged] == [True, True, False]
+    seldom = np.where(np.arange(20) < 4, 100.0, -0.05)  # an end stop that is reached in four blocks
+    assert _judged(_tempered(seldom), errors, errors, ("y",), np.arange(20), "block").gain == pytest.approx(
+        seldom.sum()
+    )
+    assert not _judged(_tempered(-seldom), errors, errors, ("y",), np.arange(20), "block").passed
+    half = {"in free run": np.where(np.arange(20) < 10, 1.0, 3.0)[:, None, None] * errors["in free run"]}
+    told = _judged(_tempered(gains), errors, half, ("y",), np.arange(20), "block", np.arange(20) // 10)
+    assert told.grows == ()  # two windows: what grows in one of them is not certain
     grown = {"in free run": 2 * errors["in free run"]}
     assert _judged(_tempered(gains), errors, grown, ("y",), np.arange(20), "block").grows == ("y in free run",)
 

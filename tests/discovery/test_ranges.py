@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.ranges import in_words, too_narrow, widened, within
+from simpel_cli.discovery.search.ranges import in_words, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.uses import FREE_RUN, suited
 from simpel_cli.discovery.verdict.beyond import beyond, sentence_of, written
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
+from simpel_cli.filtering.setup import test_windows as held_out  # pytest would take it for a test
 from simulators.effects import Expression
 from simulators.model import Declared, Model
 
@@ -79,9 +82,11 @@ def test_a_parameter_outside_its_range_is_found_there(b: float, end: int) -> Non
     assert out.low < b < out.high
     assert out.range == (0.8, 1.8)
     assert "Outside the range that sim.parameters gives" in sentence_of([out])
-    again = within(wide, chosen, {"b": (0.8, 1.8)})
+    narrow = narrowed(wide, {"b": (0.8, 1.8)})
+    assert narrow is not None
+    again = within(wide, narrow, chosen)
     row = [q.name for q in wide.plan.augmented.params].index("b")
-    at = wide.plan.coordinates.value(row, float(again.optimum.z[row]))
+    at = narrow.plan.coordinates.value(row, float(again.optimum.z[row]))
     assert at == pytest.approx((0.8, 1.8)[end], abs=0.02)
     assert again.optimum.log_evidence < chosen.optimum.log_evidence - 100
 
@@ -91,8 +96,36 @@ def test_a_range_that_holds_the_truth_stays() -> None:
     chosen = search.base()
     assert too_narrow(search, chosen) is None
     assert beyond(cart(), search, chosen, 0.0) == []
-    assert within(search, chosen, {"b": (0.8, 1.8)}) is chosen
+    assert narrowed(search, {"b": (0.8, 1.8)}) is None
     assert sentence_of([]) == ""
+
+
+def test_a_fit_is_the_same_in_other_coordinates() -> None:
+    wide = searched(measured(1.2), model=cart(0.5, 5.0))
+    narrow = narrowed(wide, {"b": (0.8, 1.8)})
+    assert narrow is not None
+    there = translated(wide, narrow, wide.base())
+    back = translated(narrow, wide, there)
+    for name in ("z", "centre", "covariance", "fisher", "gradient"):
+        np.testing.assert_allclose(
+            getattr(back.optimum, name), getattr(wide.base().optimum, name), rtol=1e-9, atol=1e-12
+        )
+    own = narrow.base().optimum
+    i = own.free.index(0)
+    assert there.optimum.z[0] == pytest.approx(own.z[0], abs=1e-3)
+    assert there.optimum.covariance[i, i] == pytest.approx(own.covariance[i, i], rel=0.05)
+
+
+def test_before_is_in_the_declared_ranges_for_every_use() -> None:
+    """Calibrated for a free run, too, the simulator as it was declared stays within what it declares."""
+    recording = measured(2.4)
+    wide = searched(recording, model=cart(0.8, 5.0))
+    narrow = narrowed(wide, {"b": (0.8, 1.8)})
+    assert narrow is not None
+    base = within(wide, narrow, wide.base())
+    windows = held_out(wide.plan, recording.train, ())
+    suited_one = translated(narrow, wide, suited(narrow, Assessor(narrow.plan, 10), base, windows, FREE_RUN))
+    assert wide.plan.coordinates.value(0, float(suited_one.optimum.z[0])) <= 1.8 + 1e-9
 
 
 def test_an_effect_stronger_than_its_range_is_not_cut_there() -> None:

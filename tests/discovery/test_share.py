@@ -18,6 +18,7 @@ NOISE = np.array([0.1, 1.0])
         ([0.342, 3.42], [0.343, 3.43], -0.006, False, False, False),
         ([10, 1.1], [1, 1.2], 0.99, False, True, True),  # a quantity at its noise says nothing
         ([0.2, 1.1], [0.15, 1.2], float("nan"), True, True, True),
+        ([0.2, 1.1], [0.4, 1.2], float("nan"), False, True, True),  # nothing was beyond the noise
     ],
 )
 def test_share(before: list, after: list, share: float, near: bool, left: bool, enough: bool) -> None:

@@ -1,6 +1,7 @@
 """The catalogue of effects: every YAML in conf/effect, at every place where it can act."""
 
 import re
+from dataclasses import replace
 
 import casadi
 import numpy as np
@@ -396,6 +397,11 @@ def test_what_a_mutual_exchange_adds_to_one_state_it_takes_from_the_other() -> N
     x, u = [20.0, 30.0, 0.5], [50.0, 45.0, 0.3]
     before = np.asarray(ROOM.function()(x, u, augment(ROOM, [], MEASURED["room"]).neutral)[0]).ravel()
     np.testing.assert_allclose(values(ROOM, terms[0], x, u, [0.01])[0] - before, (0.1, -0.1, 0), atol=1e-12)
+    for place in ("T", "floor"):  # the same term, whichever is named
+        named = replace(catalogue("mutual_exchange"), acts_on=place).attach(ROOM, SCALES["room"], MEASURED["room"])
+        assert named == terms
+    with pytest.raises(ModelError, match=r"effect.mutual_exchange.acts_on: 'water' is no state"):
+        replace(catalogue("mutual_exchange"), acts_on="water").attach(ROOM, SCALES["room"], MEASURED["room"])
     with pytest.raises(ModelError, match=r"effect.e.mutual: its term has no `other`"):
         Expression("e", "", "first_order", "-k*x", mutual=True, parameters={"k": {"range": [0, 1]}})
 

@@ -30,7 +30,7 @@ class Gate(NamedTuple):
     """Gain in held-out log-likelihood of one model over another.
 
     Args:
-        gain: nats, summed over all held-out parts.
+        gain: nats, summed over all held-out parts; of blocks, an odd one counts no more than a few of the largest others.
         low, high: 95 % interval, by resampling episodes (or windows, where there are few episodes).
         unit: what was held out at a time.
         harm: whether an error grows: of any channel, at any horizon, certainly and by more than `TOLERATED`. A model that
@@ -55,7 +55,8 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     All are refitted on all but a fold of the training episodes and score that fold, for every fold. Of a few long episodes
     windows are held out, and those that the search left out as well: they tell more, and no parameter has to be fitted again.
     A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
-    noise, which all models have, are fitted to the fold itself; parameters and effects are not.
+    noise, which all models have, are fitted to the fold itself (not of a short record, whose blocks lie between others);
+    parameters and effects are not.
     """
     trials = (whole, *parts)
     windows = search.plan.windows
@@ -65,8 +66,9 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     blocks = _blocks(windows) if few else ()
     if len(blocks) > 1:
         likelihood, errors, named = _of_blocks(search, assessor, trials, np.array(blocks))
+        runs = np.array([np.argwhere(block)[0, 0] for block in blocks])  # errors of a free run last over its blocks
         return [
-            _judged(_tempered(likelihood[0] - likelihood[k]), errors[k], errors[0], measured, named, "block")
+            _judged(_tempered(likelihood[0] - likelihood[k]), errors[k], errors[0], measured, named, "block", runs)
             for k in range(1, len(trials))
         ]
     groups = windows.episode if unit == "episode" else np.arange(len(windows.episode))
@@ -143,13 +145,13 @@ def _of_blocks(
 
 
 def _tempered(gains: np.ndarray) -> np.ndarray:
-    """Return gains of blocks, none of which counts more than `ODD` times a typical one.
+    """Return gains of blocks, none of which counts more than `ODD` times what one in ten has.
 
     A model that is nearly right and very sure of it loses hundreds of nats on one odd block, such as one at rest. Of errors
     nothing is taken away: one that grows there is harm.
     """
-    typical = ODD * float(np.median(np.abs(gains)))
-    return np.clip(gains, -typical, typical)
+    most = ODD * float(np.quantile(np.abs(gains), 0.9))
+    return np.clip(gains, -most, most)
 
 
 def _blocks(windows: Windows) -> list[np.ndarray]:
@@ -216,12 +218,18 @@ def _batches(windows: Windows, size: int) -> Iterator[tuple[np.ndarray, Windows,
 
 
 def _judged(
-    gains: np.ndarray, before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray, unit: str
+    gains: np.ndarray,
+    before: Errors,
+    after: Errors,
+    measured: Sequence[str],
+    groups: np.ndarray,
+    unit: str,
+    runs: np.ndarray | None = None,
 ) -> Gate:
-    """Judge gains (W,) and errors without and with an effect; groups: (W,)."""
+    """Judge gains (W,) and errors without and with an effect; groups: (W,), and of free runs `runs` where it is given."""
     per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
     low, high = gain_interval(per_group, np.random.default_rng(1))
-    grows = growing(before, after, measured, groups)
+    grows = growing(before, after, measured, groups if runs is None else {AHEAD["free"]: runs, "": groups})
     return Gate(float(gains.sum()), low, high, unit, bool(grows), bool(low > 0) and not grows, grows)
 
 
@@ -230,20 +238,25 @@ def errors_of(found: Assessment) -> Errors:
     return {words: getattr(found, name) for name, words in AHEAD.items()}
 
 
-def growing(before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray) -> tuple[str, ...]:
+def growing(
+    before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray | Mapping[str, np.ndarray]
+) -> tuple[str, ...]:
     """Return which errors grow by more than is tolerated, certainly: of what, and how far ahead.
 
     Args:
         before: errors of every measured channel without an effect, at every horizon.
         after: with it.
         measured: names of the channels, ny.
-        groups: of which part each window is, (W,).
+        groups: of which part each window is, (W,); or by horizon, "" for all others.
     """
+    of = groups if isinstance(groups, Mapping) else {"": groups}
     random = np.random.default_rng(1)
     found: dict[str, bool] = {}
     told = sum(int(np.isfinite(e).any(axis=(0, 1)).sum()) for e in before.values())
     most = {AHEAD[name]: 1 / (1 + tolerated) for name, tolerated in TOLERATED.items()}
     for words, error in before.items():
-        best = reduction_interval(error, after[words], groups, random, level=1 - 2 * SURE / max(told, 1))[1]
+        best = reduction_interval(
+            error, after[words], of.get(words, of[""]), random, level=1 - 2 * SURE / max(told, 1)
+        )[1]
         found |= {f"{name} {words}": value < most[words] for name, value in zip(measured, best, strict=False)}
     return tuple(words for words, grows in found.items() if grows)

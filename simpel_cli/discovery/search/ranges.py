@@ -68,20 +68,43 @@ def widened(model: Model, effects: Sequence[Expression], ranges: Mapping[str, Ra
     return replace(model, params=params, base=base), more
 
 
-def within(search: Search, base: Trial, given: Mapping[str, Range]) -> Trial:
-    """Return a model fitted within narrower ranges, by the names of their parameters, in the coordinates of a search."""
+def narrowed(search: Search, given: Mapping[str, Range]) -> Search | None:
+    """Return the search in other ranges, by the names of their parameters; None: they are the same."""
     plan = search.plan
     declared = {row: given[q.name] for row, q in enumerate(plan.augmented.params)
                 if q.name in given and given[q.name] != (q.low, q.high)}  # fmt: skip
     if not declared:
-        return base
-    narrow, z = _ranged(plan, base.optimum.z, declared)
-    found = _fitted(search, base, narrow, z)
-    best = max(found, key=lambda o: o.log_evidence)
-    back, again = best.z.copy(), plan.coordinates
-    for row in declared:
-        back[row] = again.unit(row, narrow.coordinates.value(row, float(best.z[row])))
-    return Trial(base.terms, best._replace(z=back))
+        return None
+    narrow, _ = _ranged(plan, plan.start, declared)
+    return Search(narrow, search.fitter.within(narrow.coordinates), search.report)
+
+
+def within(search: Search, narrow: Search, trial: Trial) -> Trial:
+    """Return a model of one search fitted in the other ranges of another, in the coordinates of that."""
+    z = translated(search, narrow, trial).optimum.z
+    starts = [Hypothesis(at, trial.optimum.free, search.ones) for at in (z, narrow.loud(z))]
+    return Trial(trial.terms, max(narrow.fitter(starts), key=lambda o: o.log_evidence))
+
+
+def translated(old: Search, new: Search, trial: Trial) -> Trial:
+    """Return a fit of one search in the coordinates of another with other ranges; values beyond an end lie at it."""
+    before, after, optimum = old.plan.coordinates, new.plan.coordinates, trial.optimum
+    z, centre, scale = optimum.z.copy(), optimum.centre.copy(), np.ones(len(optimum.free))
+    moved = np.flatnonzero((before.low != after.low) | (before.high != after.high))
+    for row in (int(i) for i in moved if i < len(z)):
+        z[row] = after.unit(row, before.value(row, float(z[row])))
+        if row in optimum.free:
+            k, span = optimum.free.index(row), after.high[row] - after.low[row]
+            scale[k] = (before.high[row] - before.low[row]) / span
+            centre[k] = scale[k] * centre[k] + (before.low[row] - after.low[row]) / span
+    both = np.outer(scale, scale)
+    return Trial(
+        trial.terms,
+        optimum._replace(
+            z=z, centre=centre, covariance=optimum.covariance * both, fisher=optimum.fisher / both,
+            gradient=optimum.gradient / scale,
+        ),
+    )  # fmt: skip
 
 
 def in_words(found: Wider) -> str:

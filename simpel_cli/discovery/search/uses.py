@@ -4,10 +4,10 @@ The innovations say which physics; a model that is still wrong somewhere has par
 others that simulate best. So with the effects settled the parameters are fitted once more, to the errors so far ahead as the
 model will be used,
 
-    1/2 sum_k e_k^2 / (sigma^2 tau) + 6 |z - z_0|^2,
+    1/2 sum_k e_k^2 / (sigma^2 tau) + 1/2 |(z - z_0) / s|^2,
 
-sigma and tau the size and the integrated autocorrelation time of the errors before. The second term is the variance of a
-uniform prior, about where the innovations put it: what these errors do not tell stays there.
+sigma and tau the size and the integrated autocorrelation time of the errors before, s the standard deviation of the prior. The
+second term is that prior, about where the innovations put it: what these errors do not tell stays there.
 
 Reference: Ljung (1999), System identification, 7.2 (output error); Geyer (1992), Practical Markov chain Monte Carlo, 3.3 (tau);
 Nocedal and Wright (2006), Numerical optimization, 10.3.
@@ -20,12 +20,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.errors_ahead import Assessor, with_lost
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 
 ONE_STEP, FREE_RUN = "one_step", "free_run"
 NUDGE = 1e-4  # of a range, for differences
+HALF_TURN = 2.8  # rad: an error of an angle beyond may jump by a turn
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 30  # evaluations
 MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
@@ -55,8 +56,14 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     count = np.isfinite(before).sum(axis=(0, 1))
     sigma = np.sqrt(np.nansum(before**2, axis=(0, 1)) / np.maximum(count, 1))
     there = np.isfinite(windows.y) & (windows.ok > 0) & np.isfinite(before) & (sigma > 0)
+    periodic = {q.name for q in search.plan.augmented.model.states if q.periodic}
+    turns = [name in periodic for name in search.plan.augmented.measured]
+    there &= ~(np.array(turns) & (np.abs(np.nan_to_num(before)) > HALF_TURN))  # where an error jumps it has no slope
     if not there.any():
         return trial
+
+    sd = np.asarray(search.plan.coordinates.sd_of_prior())[rows]
+    prior = np.sqrt(np.where(np.isfinite(sd), 1 / sd**2, LEAST_CURVATURE))
 
     def residual(at: np.ndarray) -> np.ndarray:
         """Return what is squared, (models, residuals); at: (models, unknowns)."""
@@ -64,7 +71,7 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
         moved[:, rows] = at
         e = (errors(moved) / (sigma * np.sqrt(tau)))[:, there]
         e = np.where(np.isfinite(e), np.clip(e, -LOST, LOST), LOST)
-        return np.concatenate([e, np.sqrt(LEAST_CURVATURE) * (at - z[rows])], axis=1)
+        return np.concatenate([e, prior * (at - z[rows])], axis=1)
 
     def slope(at: np.ndarray) -> np.ndarray:
         step = np.where(at > 0.5, -NUDGE, NUDGE)
@@ -105,7 +112,8 @@ def suited(search: Search, assessor: Assessor, trial: Trial, windows: Windows, u
         rest, held = (Windows(*(a[part] for a in windows)) for part in (~out, out))
         own = Trial(trial.terms, optimum)
         both = np.stack([t.optimum.z for t in (own, calibrated_for(search, assessor, own, rest, use))])
-        squares += np.nansum(_errors_of(assessor, held, use, dt)(both) ** 2, axis=(1, 2))
+        first, second = _errors_of(assessor, held, use, dt)(both)
+        squares += [np.nansum(e**2, axis=(0, 1)) for e in with_lost(first, second)]
     seen = (squares > 0).all(axis=0)
     better = bool(np.log(squares[1, seen] / squares[0, seen]).sum() < 0)
     return calibrated_for(search, assessor, trial, windows, use) if better else trial

@@ -9,6 +9,7 @@ import numpy as np
 from simpel_cli.discovery.search.trials import Search, Trial
 from simulators.effects import Term
 from simulators.effects.term import DELAY, OPERATORS, SENSOR, SENSOR_DELAY
+from simulators.groups import slots_of
 
 POINTS = 64
 SAME = 1e-6  # of the larger function
@@ -21,7 +22,8 @@ def of_structure(search: Search, term: Term) -> list[Term]:
     row tells them apart, and of that nothing was recorded.
     """
     model = search.plan.augmented.model
-    driven = [q.name for q in model.inputs if q.name not in model.covariates]
+    slots = {model.inputs[j].name for of in slots_of(model) for j in of}  # which group an episode is of never changes
+    driven = [q.name for q in model.inputs if q.name not in slots]
     if term.kind not in (DELAY, SENSOR_DELAY) or len(driven) != 1 or len(search.plan.augmented.measured) != 1:
         return []
     other = SENSOR_DELAY if term.kind == DELAY else DELAY

@@ -16,7 +16,7 @@ class Beyond(NamedTuple):
         unit: of it.
         range: given.
         value, low, high: estimate and 90 % interval.
-        gain: nats of evidence of the wider ranges, of all of them together.
+        gain: nats by which the evidence of the model is ahead of that within the ranges that were given, all of them together.
     """
 
     name: str

@@ -37,7 +37,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     terms = [search.terms[t] for t in trial.terms]
     added = "_with_" + "_and_".join(t.effect for t in terms)
     by = {one.how.by for one in differing(search, trial) if not one.effect}
-    name = sim["name"] + (added if terms else "_by_" + "_and_".join(sorted(by)))
+    name = sim["name"] + (added if terms else "_by_" + "_and_".join(sorted(by)) if by else "_in_wider_ranges")
     taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
     taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
     readings = {q.name for q in model.states if q.role == READING}

@@ -31,11 +31,13 @@ class Open(NamedTuple):
             false; the largest is 1.
         logarithmic: whether all of them have one sign.
         information: of the data along it, in units of that of the ranges; below 1.
+        alone: whether no other such combination has any of its parameters.
     """
 
     move: dict[str, float]
     logarithmic: bool
     information: float
+    alone: bool = True
 
     @property
     def words(self) -> str:
@@ -45,7 +47,7 @@ class Open(NamedTuple):
             return names[0]
         ways = [f"{n} {'up' if v > 0 else 'down'}" for n, v in self.move.items()]
         moves = f"{' with '.join(ways)}"
-        if not self.logarithmic or len(names) != 2:
+        if not self.logarithmic or len(names) != 2 or not self.alone:
             return moves
         first, second = self.move.values()
         least = min(abs(first), abs(second))
@@ -66,7 +68,8 @@ def left_open(search: Search, chosen: Trial) -> list[Open]:
     # the curvature of a prior is what was declared, and no word of the data
     sd = np.asarray(plan.coordinates.sd_of_prior())[list(optimum.free)]
     fisher = optimum.fisher - np.diag(np.where(np.isfinite(sd), 1 / sd**2, 0.0))
-    between = fisher[np.ix_(others, others)] + LEAST_CURVATURE * np.eye(len(others))
+    held = np.where(np.isfinite(sd[others]), 1 / sd[others] ** 2, LEAST_CURVATURE)
+    between = fisher[np.ix_(others, others)] + np.diag(held)
     cross = fisher[np.ix_(at, others)]
     own = fisher[np.ix_(at, at)] - cross @ np.linalg.solve(between, cross.T)
     known = np.where(np.isfinite(sd[at]), 1 / sd[at] ** 2, LEAST_CURVATURE)
@@ -77,7 +80,7 @@ def left_open(search: Search, chosen: Trial) -> list[Open]:
         if value >= 1:
             break
         found.append(_open(plan, optimum.z, rows, vector * scale, float(max(value, 0.0))))
-    return found
+    return [one._replace(alone=not any(set(one.move) & set(o.move) for o in found if o is not one)) for one in found]
 
 
 def sentence_of(found: list[dict[str, Any]]) -> str:

@@ -46,7 +46,7 @@ def still_wrong(search: Search, chosen: Trial, worst: str, times: float, horizon
         "unit": _unit(search, worst),
         "log_evidence_gain": None,
         "description": f"the errors of {worst} {horizon} rows ahead stay {times:.2g} times as large as its noise, and no "
-        "function of the states and inputs that was tried makes them smaller",
+        "function of the states and inputs that was tried explains the rest",
     }
 
 

@@ -30,6 +30,8 @@ class Explained(NamedTuple):
 
     def enough(self, *, left: bool) -> bool:
         """Whether the residual may be called explained; left: whether an error remains that is no white noise."""
+        if not np.isfinite(self.share):  # nothing was beyond the noise before
+            return True
         return self.near or bool(self.share >= (MOST if left else SOME))
 
 

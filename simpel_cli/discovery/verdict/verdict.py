@@ -5,19 +5,20 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Check
-from simpel_cli.discovery.search.held_out_gate import Gate, errors_of, growing
+from simpel_cli.discovery.search.held_out_gate import AHEAD, Errors, Gate, errors_of, growing
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
 from simpel_cli.discovery.verdict.share import explained
-from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
-from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, in_blocks, reduction_interval, results, rmse
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of
 from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
+BLOCKS = 10  # of a test episode, where there are few
 ALL = 0.95  # of the residual
 LOST = -20.0  # nats: a fit so far below the simpler model has not converged, and its size has no meaning
 SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
@@ -65,8 +66,9 @@ def verdict_of(
             remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon),
         )
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
-    interval = reduction_interval(before.ahead, after.ahead, windows.episode, np.random.default_rng(2))
-    grows = growing(errors_of(before), errors_of(after), measured, windows.episode)
+    first, second, parts = _parts(before, after, windows)
+    interval = reduction_interval(first[AHEAD["ahead"]], second[AHEAD["ahead"]], parts, np.random.default_rng(2))
+    grows = growing(first, second, measured, parts)
     found = {
         "verdict": kind,
         "summary": "",
@@ -107,6 +109,18 @@ def verdict_of(
     }
     warning = f" With it the test error of {' and of '.join(grows)} grows." if grows else ""
     return found | {"summary": sentence(found, before, after, measured) + warning}
+
+
+def _parts(before: Assessment, after: Assessment, windows: Windows) -> tuple[Errors, Errors, np.ndarray]:
+    """Return errors without and with the effects, by horizon, and of which part of the test each window is.
+
+    Parts are episodes; of one or two of them blocks of rows, since so few have no interval.
+    """
+    first, second = errors_of(before), errors_of(after)
+    if len(np.unique(windows.episode)) >= LEAST_EPISODES:
+        return first, second, windows.episode
+    cut = [{words: in_blocks(e, BLOCKS) for words, e in errors.items()} for errors in (first, second)]
+    return cut[0], cut[1], np.arange(BLOCKS * len(windows.episode))
 
 
 def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
@@ -241,12 +255,13 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         gain = (
             f"No test episode is longer than {steps} rows, so the error so far ahead is not known (discovery.horizon)."
         )
-    parts, share = [_phrase(e) for e in found["effects"]], max(found["share_explained"], 0.0)
+    parts, share = [_phrase(e) for e in found["effects"]], float(np.nan_to_num(max(found["share_explained"], 0.0)))
     listed = " and ".join(parts)
     rest = f" The remaining model error depends on {dependence(found['remainder'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
-            much = f"{share:.0%} of the model error" if share < ALL else "the residual"
+            told = np.isfinite(found["share_explained"]) and share < ALL
+            much = f"{share:.0%} of the model error" if told else "the residual"
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} {much}. {gain}{rest}"
         case "ambiguous":
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
@@ -263,7 +278,8 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         case _:
             text = "No missing effect was found: the calibrated simulator explains these data"
             if not np.array_equal(first, second, equal_nan=True):
-                text = f"{text} where parameters differ. {gain.removesuffix('.')}"
+                where = " where parameters differ" if found["groups"] else ""
+                text = f"{text}{where}. {gain.removesuffix('.')}"
             if found["process_noise"]["share_after"] < SHAKEN:
                 return f"{text}."
             return (
