@@ -17,7 +17,7 @@ AHEAD = {"one_step": "one row ahead", "ahead": "some rows ahead", "free": "in fr
 FEW = 10  # windows of a record: fewer cannot tell, and blocks of rows are held out
 LEAST_BLOCKS = 20
 LEAST_OF_BLOCK = 8  # rows
-ODD = 3.0
+ORDINARY = 0.9  # of the blocks: larger gains and losses than these have are odd
 MOST_FOLDS = 5
 TOLERATED = {"one_step": 0.1, "ahead": 0.02, "free": 0.02}  # of an error: so much it may grow
 SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
@@ -30,7 +30,7 @@ class Gate(NamedTuple):
     """Gain in held-out log-likelihood of one model over another.
 
     Args:
-        gain: nats, summed over all held-out parts; of blocks, an odd one counts no more than a few of the largest others.
+        gain: nats, summed over all held-out parts; of blocks, an odd one counts no more than the largest others.
         low, high: 95 % interval, by resampling episodes (or windows, where there are few episodes).
         unit: what was held out at a time.
         harm: whether an error grows: of any channel, at any horizon, certainly and by more than `TOLERATED`. A model that
@@ -145,12 +145,12 @@ def _of_blocks(
 
 
 def _tempered(gains: np.ndarray) -> np.ndarray:
-    """Return gains of blocks, none of which counts more than `ODD` times what one in ten has.
+    """Return gains of blocks, none of which counts more than what one in ten reaches.
 
     A model that is nearly right and very sure of it loses hundreds of nats on one odd block, such as one at rest. Of errors
     nothing is taken away: one that grows there is harm.
     """
-    most = ODD * float(np.quantile(np.abs(gains), 0.9))
+    most = float(np.quantile(np.abs(gains), ORDINARY))
     return np.clip(gains, -most, most)
 
 
