@@ -144,9 +144,10 @@ def of_class(cls: type) -> Schema:
             node["description"] = docs[field.name]
         if isinstance(field.default, bool | int | float | str):
             node["default"] = field.default
-        properties[field.name] = node
+        key = field.name.removesuffix("_")  # a word that Python keeps for itself has an underscore behind it
+        properties[key] = node
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            required.append(field.name)
+            required.append(key)
     node = {"type": "object", "properties": properties, "additionalProperties": False}
     return node | ({"required": required} if required else {})
 
