@@ -1,6 +1,6 @@
 """A whole search: in clean measurements, with the inputs between rows and the differences between groups that it finds."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, suited
+from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for, suited
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
@@ -187,14 +187,15 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
         base = within(search, narrow, base)
     whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
 
-    def of_use(search: Search, trial: Trial) -> Trial:
+    def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial] = suited) -> Trial:
         assessor = Assessor(search.plan, found.assessor.horizon)
-        return suited(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
+        return calibration(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
     path, before = selection.path, selection.path[-1]
     if use != ONE_STEP:
-        base = of_use(narrow or search, base)
-        path = tuple(of_use(search, t) for t in path)
+        base, chosen = of_use(narrow or search, base), of_use(search, before)
+        # what is between follows the last
+        path = (*(of_use(search, t, calibrated_for) for t in path[:-1]), chosen) if chosen is not before else path
     base = base if narrow is None else translated(narrow, search, base)
     selection = selection._replace(base=base, chosen=path[-1], path=path)
     found = found._replace(wider=wider, selection=selection)
