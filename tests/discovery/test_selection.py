@@ -14,6 +14,7 @@ from test_disturbances import pushed
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
+from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.score_test import Score
@@ -366,7 +367,7 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
     monkeypatch.setattr(acceptance, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
     none: Any = None
     options: Any = SimpleNamespace(beginnings=0)
-    search: Any = SimpleNamespace(banned=set())
+    search: Any = SimpleNamespace(banned=set(), budget=Budget())
     selection, gates = unwrap(accepted)(search, none, none, options, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]

@@ -6,8 +6,8 @@ model will be used,
 
     1/2 sum_k e_k^2 / (sigma^2 tau) + 1/2 |(z - z_0) / s|^2,
 
-sigma and tau the size and the integrated autocorrelation time of the errors before, s the standard deviation of the prior. The
-second term is that prior, about where the innovations put it: what these errors do not tell stays there.
+sigma and tau the size (per episode) and the integrated autocorrelation time of the errors before, s the standard deviation of
+the prior. The second term is that prior, about where the innovations put it: what these errors do not tell stays there.
 
 Reference: Ljung (1999), System identification, 7.2 (output error); Geyer (1992), Practical Markov chain Monte Carlo, 3.3 (tau);
 Nocedal and Wright (2006), Numerical optimization, 10.3.
@@ -23,9 +23,11 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor, with_lost
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
+from simulators.effects.term import ON_SENSOR, SENSOR
 
 ONE_STEP, FREE_RUN = "one_step", "free_run"
 NUDGE = 1e-4  # of a range, for differences
+MOST_TIMES = 3.0
 HALF_TURN = 2.8  # rad: an error of an angle beyond may jump by a turn
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 15  # steps
@@ -46,16 +48,20 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
         windows: of the training rows, each as long as its episode.
         use: ONE_STEP, FREE_RUN, or how far ahead, s.
     """
-    rows = [i for i in trial.optimum.free if i not in search.noise]
+    # a sensor's parameters would move what the filter begins with, not what is simulated
+    sensors = {
+        i for t, term in enumerate(search.terms) if term.kind in (SENSOR, *ON_SENSOR) for i in search.all_rows(t)
+    }
+    rows = [i for i in trial.optimum.free if i not in search.noise and i not in sensors]
     if use == ONE_STEP or not rows:
         return trial
     errors = _errors_of(assessor, windows, use, search.plan.augmented.model.dt)
     z = trial.optimum.z
     before = errors(z[None])[0]
     tau = correlation_time(before)
-    count = np.isfinite(before).sum(axis=(0, 1))
-    sigma = np.sqrt(np.nansum(before**2, axis=(0, 1)) / np.maximum(count, 1))
+    sigma = _sizes(before)
     there = np.isfinite(windows.y) & (windows.ok > 0) & np.isfinite(before) & (sigma > 0)
+    sigma = np.where(sigma > 0, sigma, 1.0)
     periodic = {q.name for q in search.plan.augmented.model.states if q.periodic}
     turns = [name in periodic for name in search.plan.augmented.measured]
     there &= ~(np.array(turns) & (np.abs(np.nan_to_num(before)) > HALF_TURN))  # where an error jumps it has no slope
@@ -91,6 +97,16 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
 
 
+def _sizes(errors: np.ndarray) -> np.ndarray:
+    """Return the size of errors (W, T, ny) per window, (W, 1, ny): what is wrong grows with the motion.
+
+    No window counts more than `MOST_TIMES` a typical one for having small errors.
+    """
+    count = np.maximum(np.isfinite(errors).sum(axis=1, keepdims=True), 1)
+    own = np.sqrt(np.nansum(errors**2, axis=1, keepdims=True) / count)
+    return np.maximum(own, np.median(own, axis=0) / MOST_TIMES)
+
+
 def suited(search: Search, assessor: Assessor, trial: Trial, windows: Windows, use: str | float) -> Trial:
     """Return a model with the parameters that suit a use, where they do so on episodes that had no part in them, too.
 
@@ -106,16 +122,17 @@ def suited(search: Search, assessor: Assessor, trial: Trial, windows: Windows, u
     episode, dt = search.plan.windows.episode, search.plan.augmented.model.dt
     weights = [np.where(np.isin(episode, fold), 0.0, 1.0) for fold in folds]
     fits = search.fitter([Hypothesis(trial.optimum.z, trial.optimum.free, weight) for weight in weights])
-    squares = np.zeros((2, windows.y.shape[2]))
+    ratios = []
     for fold, optimum in zip(folds, fits, strict=True):
         out = np.isin(windows.episode, fold)
         rest, held = (Windows(*(a[part] for a in windows)) for part in (~out, out))
         own = Trial(trial.terms, optimum)
         both = np.stack([t.optimum.z for t in (own, calibrated_for(search, assessor, own, rest, use))])
         first, second = _errors_of(assessor, held, use, dt)(both)
-        squares += [np.nansum(e**2, axis=(0, 1)) for e in with_lost(first, second)]
-    seen = (squares > 0).all(axis=0)
-    better = bool(np.log(squares[1, seen] / squares[0, seen]).sum() < 0)
+        squares = np.stack([np.nansum(e**2, axis=(0, 1)) for e in with_lost(first, second)])
+        seen = (squares > 0).all(axis=0)
+        ratios.append(float(np.log(squares[1, seen] / squares[0, seen]).sum()))
+    better = sum(ratios) < 0  # of every fold alike: the largest motions do not decide for all
     return calibrated_for(search, assessor, trial, windows, use) if better else trial
 
 
