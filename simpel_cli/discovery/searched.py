@@ -185,7 +185,6 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
     if narrow is not None:
         wider = selection.chosen.optimum.log_evidence - within(search, narrow, selection.chosen).optimum.log_evidence
         base = within(search, narrow, base)
-    whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
 
     def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial] = suited) -> Trial:
         assessor = Assessor(search.plan, found.assessor.horizon)
@@ -193,6 +192,7 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
 
     path, before = selection.path, selection.path[-1]
     if use != ONE_STEP:
+        whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
         base, chosen = of_use(narrow or search, base), of_use(search, before)
         # what is between follows the last
         path = (*(of_use(search, t, calibrated_for) for t in path[:-1]), chosen) if chosen is not before else path

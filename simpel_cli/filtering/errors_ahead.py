@@ -11,9 +11,10 @@ from jaxtyping import Array
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.track import Filter, Track
-from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.filtering.setup import Setup
 
+BLOCKS = 10  # of a test window, where there are few episodes
 RAN_AWAY = 1e3  # times the other model's error, where a model has none
 SETTLE = 5  # rows after which the filter knows a state that it started without
 LOG_2PI = float(np.log(2 * np.pi))
@@ -135,15 +136,19 @@ def with_lost(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.nda
     return found[0], found[1]
 
 
-def in_blocks(errors: np.ndarray, count: int) -> np.ndarray:
-    """Cut the windows of errors (W, T, ny) into blocks of rows, (W count, rows, ny): one episode alone has no interval.
+def in_parts(errors: np.ndarray, episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors (W, T, ny) of test windows with the number of the part that each is of, for intervals by resampling.
+
+    Parts are episodes; of one or two of them, which have no interval, blocks of rows: (W BLOCKS, rows, ny), (W BLOCKS,).
 
     Reference: Kuensch (1989), The jackknife and the bootstrap for general stationary observations.
     """
+    if len(np.unique(episode)) >= LEAST_EPISODES:
+        return errors, np.unique(episode, return_inverse=True)[1]
     windows, rows, ny = errors.shape
-    length = -(-rows // count)
-    padded = np.concatenate([errors, np.full((windows, count * length - rows, ny), np.nan)], axis=1)
-    return padded.reshape(windows * count, length, ny)
+    length = -(-rows // BLOCKS)
+    padded = np.concatenate([errors, np.full((windows, BLOCKS * length - rows, ny), np.nan)], axis=1)
+    return padded.reshape(windows * BLOCKS, length, ny), np.arange(windows * BLOCKS)
 
 
 def gain_interval(gain: np.ndarray, random: np.random.Generator, draws: int = 4000) -> tuple[float, float]:

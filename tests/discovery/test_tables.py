@@ -14,7 +14,7 @@ from simpel_cli.discovery.verdict.tables import (
     residual_columns,
     trajectory_columns,
 )
-from simpel_cli.filtering.errors_ahead import SETTLE, Assessment
+from simpel_cli.filtering.errors_ahead import BLOCKS, SETTLE, Assessment, in_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import windows_of
 
@@ -78,24 +78,37 @@ def test_innovations_and_free_runs() -> None:
 
 
 def test_errors() -> None:
-    """RMSE by horizon, and the ratio; the interval is that of a resampling of two episodes."""
-    by_episode = np.where(WINDOWS.episode == 0, 3.0, 1.0)[:, None, None]
+    """RMSE by horizon, and the ratio; the interval is that of a resampling of three episodes."""
+    three = WINDOWS._replace(episode=np.minimum(np.arange(len(WINDOWS.episode)), 2))
+    by_episode = np.where(three.episode == 0, 3.0, 1.0)[:, None, None]
     before, after = assessment(by_episode, 2 * by_episode, np.nan), assessment(1.0)
-    table = error_columns(before, after, WINDOWS, {"x": "m"}, {"x": 0.1})
+    table = error_columns(before, after, three, {"x": "m"}, {"x": 0.1})
     assert table["horizon"].tolist() == ["one_step", "horizon", "free_run"]
-    share = np.mean(WINDOWS.episode == 0)
+    share = np.mean(three.episode == 0)
     assert table["before"][0] == pytest.approx(np.sqrt(9 * share + 1 - share))
     assert table["before"][1] == pytest.approx(2 * table["before"][0])
     assert np.isnan(table["before"][2])
+    assert np.isnan(table["before_low"][2])
     np.testing.assert_allclose(table["reduction"][:2], table["before"][:2])
     assert (table["before_low"][0], table["before_high"][0]) == pytest.approx((1.0, 3.0))
     assert (table["reduction_low"][1], table["reduction_high"][1]) == pytest.approx((2.0, 6.0))
     assert table["after_low"][0] == table["after_high"][0] == 1.0
 
 
-def test_one_episode_has_no_interval() -> None:
+def test_one_episode_has_the_interval_of_its_blocks() -> None:
     alone = WINDOWS._replace(episode=np.zeros(len(WINDOWS.episode), int))
-    table = error_columns(assessment(2.0), assessment(1.0), alone, {"x": "m"}, {"x": 0.1})
-    assert table["reduction"][0] == pytest.approx(2.0)
-    assert np.isnan(table["reduction_low"]).all()
-    assert np.isnan(table["before_high"]).all()
+    rows = alone.ok.shape[1]
+    half = np.where(np.arange(rows) < rows // 2, 4.0, 2.0)[None, :, None]
+    table = error_columns(assessment(half), assessment(1.0), alone, {"x": "m"}, {"x": 0.1})
+    assert 2 < table["reduction_low"][0] < table["reduction"][0] < table["reduction_high"][0] < 4
+    assert table["after_low"][0] == table["after_high"][0] == 1.0
+
+
+def test_blocks_of_few_episodes_lose_no_error() -> None:
+    errors = np.random.default_rng(0).normal(size=(2, 37, 3))
+    cut, parts = in_parts(errors, np.array([0, 1]))
+    assert cut.shape[0] == len(parts) == len(np.unique(parts)) == 2 * BLOCKS
+    np.testing.assert_allclose(np.nansum(cut**2, axis=(0, 1)), np.sum(errors**2, axis=(0, 1)))
+    same, episodes = in_parts(np.repeat(errors, 2, axis=0), np.array([5, 7, 5, 9]))
+    assert same.shape == (4, 37, 3)
+    assert episodes.tolist() == [0, 1, 0, 2]

@@ -9,7 +9,7 @@ from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import interval_of
-from simpel_cli.filtering.errors_ahead import SETTLE, Assessment
+from simpel_cli.filtering.errors_ahead import SETTLE, Assessment, in_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import Windows, pieces
 from simulators.groups import MEMBER, SPREAD
@@ -123,7 +123,7 @@ def trajectory_columns(
 def error_columns(
     before: Assessment, after: Assessment, windows: Windows, measured: Mapping[str, str], noise: Mapping[str, float]
 ) -> Columns:
-    """Return RMSE before and after by horizon with 95 % intervals, by resampling whole episodes; NaN for one episode.
+    """Return RMSE before and after by horizon with 95 % intervals, by resampling the parts of the test (`in_parts`).
 
     Args:
         before: the calibrated simulator on the windows.
@@ -133,20 +133,21 @@ def error_columns(
         noise: name -> standard deviation of the measurement noise.
     """
     rows: list[dict[str, Any]] = []
-    episodes = np.unique(windows.episode)
-    chosen = np.random.default_rng(3).integers(0, len(episodes), (DRAWS, len(episodes)))
     for horizon in HORIZONS:
         pair = [{"one_step": a.one_step, "horizon": a.ahead, "free_run": a.free}[horizon] for a in (before, after)]
-        sums = [np.stack([_squares(e[windows.episode == n]) for n in episodes]) for e in pair]
+        cut = [in_parts(e, windows.episode) for e in pair]
+        names = np.unique(cut[0][1])
+        chosen = np.random.default_rng(3).integers(0, len(names), (DRAWS, len(names)))
+        sums = [np.stack([_squares(e[parts == n]) for n in names]) for e, parts in cut]
         whole = [_root(s.sum(axis=0)) for s in sums]
         drawn = [_root(s[chosen].sum(axis=1)) for s in sums]
         for j, (name, unit) in enumerate(measured.items()):
             row = {"horizon": horizon, "output": name, "unit": unit, "noise_floor": noise[name]}
-            row |= _estimate("before", whole[0][j], drawn[0][:, j], len(episodes))
-            row |= _estimate("after", whole[1][j], drawn[1][:, j], len(episodes))
+            row |= _estimate("before", whole[0][j], drawn[0][:, j])
+            row |= _estimate("after", whole[1][j], drawn[1][:, j])
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio, ratios = whole[0][j] / whole[1][j], drawn[0][:, j] / drawn[1][:, j]
-            rows.append(row | _estimate("reduction", ratio, ratios, len(episodes)))
+            rows.append(row | _estimate("reduction", ratio, ratios))
     return as_columns(rows)
 
 
@@ -161,9 +162,10 @@ def _root(sums: np.ndarray) -> np.ndarray:
         return np.sqrt(sums[..., 0, :] / sums[..., 1, :])
 
 
-def _estimate(name: str, value: float, drawn: np.ndarray, episodes: int) -> dict[str, float]:
-    """Value and 95 % interval; none from one episode, and none where a draw had nothing to count."""
-    low, high = (np.nan, np.nan) if episodes < 2 else np.quantile(drawn, [0.025, 0.975])
+def _estimate(name: str, value: float, drawn: np.ndarray) -> dict[str, float]:
+    """Value and 95 % interval; none where nothing was measured. Blocks without an error at a horizon do not count."""
+    known = drawn[np.isfinite(drawn)]
+    low, high = np.quantile(known, [0.025, 0.975]) if known.size else (np.nan, np.nan)
     return {name: float(value), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 

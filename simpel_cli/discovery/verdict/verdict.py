@@ -12,13 +12,12 @@ from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
 from simpel_cli.discovery.verdict.share import explained
-from simpel_cli.filtering.errors_ahead import Assessment, Assessor, in_blocks, reduction_interval, results, rmse
-from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, in_parts, reduction_interval, results, rmse
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of
 from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
-BLOCKS = 10  # of a test episode, where there are few
 ALL = 0.95  # of the residual
 LOST = -20.0  # nats: a fit so far below the simpler model has not converged, and its size has no meaning
 SHAKEN = 0.01  # of the typical change in a row: process noise that is worth a word
@@ -112,15 +111,12 @@ def verdict_of(
 
 
 def _parts(before: Assessment, after: Assessment, windows: Windows) -> tuple[Errors, Errors, np.ndarray]:
-    """Return errors without and with the effects, by horizon, and of which part of the test each window is.
-
-    Parts are episodes; of one or two of them blocks of rows, since so few have no interval.
-    """
-    first, second = errors_of(before), errors_of(after)
-    if len(np.unique(windows.episode)) >= LEAST_EPISODES:
-        return first, second, windows.episode
-    cut = [{words: in_blocks(e, BLOCKS) for words, e in errors.items()} for errors in (first, second)]
-    return cut[0], cut[1], np.arange(BLOCKS * len(windows.episode))
+    """Return errors without and with the effects, by horizon, and of which part of the test each window is."""
+    first, second = (
+        {words: in_parts(e, windows.episode) for words, e in errors_of(found).items()} for found in (before, after)
+    )
+    parts = first[AHEAD["ahead"]][1]
+    return {k: e for k, (e, _) in first.items()}, {k: e for k, (e, _) in second.items()}, parts
 
 
 def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
