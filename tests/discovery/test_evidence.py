@@ -103,5 +103,7 @@ def test_errors_fall_and_free_runs_are_named(shown: dict[str, EvidenceTable]) ->
     assert set(runs["episode"]) == {"4"}
     errors, _ = shown["errors"]
     assert errors["output"].tolist() == ["s", "v"] * 3
-    assert np.isnan(errors["reduction_low"]).all()  # one test episode
+    # one test episode: the intervals are those of its blocks
+    assert (errors["reduction_low"] < errors["reduction"]).all()
+    assert (errors["reduction"] < errors["reduction_high"]).all()
     assert {"before", "after"} == set(shown["innovations"].columns["model"])
