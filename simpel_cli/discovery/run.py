@@ -18,9 +18,8 @@ from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_t
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.searched import Searched, latencies_of, search_of, with_latencies
-from simpel_cli.discovery.verdict.beyond import Beyond, beyond
+from simpel_cli.discovery.verdict.beyond import Beyond, beyond, ranges_of
 from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges
-from simpel_cli.discovery.verdict.beyond import written as ranged
 from simpel_cli.discovery.verdict.corrected import corrected
 from simpel_cli.discovery.verdict.determined import left_open
 from simpel_cli.discovery.verdict.determined import sentence_of as of_open
@@ -173,11 +172,11 @@ def _correct(
     nowhere = [f"{name} per {by} ({IN_PYTHON})" for name, by in per.items() if name not in declared_in(config["sim"])]
     nowhere += [f"the range of {b.name} ({IN_PYTHON})" for b in outside if b.name not in declared_in(config["sim"])]
     changes = len(per) + len(outside)
+    said = ranges_of(outside)
+    said |= {name: said.get(name, {}) | {"per": by} for name, by in per.items()}
     if not found["effects"] and len(nowhere) == changes:
         return {"corrected_sim_lacks": nowhere}
-    name, node, left_out = corrected(
-        ranged(written(config["sim"], per), outside), model, searched.search, searched.selection.chosen
-    )
+    name, node, left_out = corrected(written(config["sim"], said), model, searched.search, searched.selection.chosen)
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
     for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):

@@ -146,10 +146,10 @@ def test_parameters_that_cannot_differ_are_not_asked_about() -> None:
 
 def test_where_it_is_declared() -> None:
     own = {"name": "s", "parameters": {"b": {"range": [0, 1]}, "m": 2.0}}
-    assert written(own, {"b": "rig"})["parameters"] == {"b": {"range": [0, 1], "per": "rig"}, "m": 2.0}
+    assert written(own, {"b": {"per": "rig"}})["parameters"] == {"b": {"range": [0, 1], "per": "rig"}, "m": 2.0}
     assert own["parameters"]["b"] == {"range": [0, 1]}  # type: ignore[index]
     on = {"name": "t", "base": own, "parameters": {"c": {"range": [0, 1]}}}
-    found = written(on, {"b": "rig", "c": "day"})
+    found = written(on, {"b": {"per": "rig"}, "c": {"per": "day"}})
     assert found["base"]["parameters"]["b"]["per"] == "rig"
     assert found["parameters"] == {"c": {"range": [0, 1], "per": "day"}}
     assert written(own, {}) == own

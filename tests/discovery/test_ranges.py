@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.search.own_parameters import written
 from simpel_cli.discovery.search.ranges import in_words, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.uses import FREE_RUN, suited
-from simpel_cli.discovery.verdict.beyond import beyond, sentence_of, written
+from simpel_cli.discovery.verdict.beyond import beyond, ranges_of, sentence_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
@@ -165,10 +166,10 @@ def test_the_corrected_simulator_says_the_wider_range() -> None:
     search = searched(measured(2.4), model=cart(0.8, 5.0))
     (out,) = beyond(cart(), search, search.base(), 9.0)
     sim = {"parameters": {"b": {"unit": "A", "range": [0.8, 1.8]}, "m": 2.0}}
-    low, high = written(sim, [out])["parameters"]["b"]["range"]
+    low, high = written(sim, ranges_of([out]))["parameters"]["b"]["range"]
     assert low == 0.8
     assert 2.39 < high < 2.5
-    assert written(sim, []) == sim
-    based = written({"base": sim, "parameters": {}}, [out])
+    assert written(sim, ranges_of([])) == sim
+    based = written({"base": sim, "parameters": {}}, ranges_of([out]))
     assert based["base"]["parameters"]["b"]["range"] == [low, high]
     assert sim["parameters"]["b"] == {"unit": "A", "range": [0.8, 1.8]}

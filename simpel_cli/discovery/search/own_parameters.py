@@ -100,12 +100,17 @@ def declared_in(sim: dict[str, Any]) -> set[str]:
     return own | (declared_in(sim["base"]) if isinstance(sim.get("base"), dict) else set())
 
 
-def written(sim: dict[str, Any], per: Mapping[str, str]) -> dict[str, Any]:
-    """Return the `sim:` node whose parameters differ; one that is built on another says so where it is declared."""
+def written(sim: dict[str, Any], said: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the `sim:` node with more said of its parameters; one that is built on another says it where they are declared.
+
+    Args:
+        sim: the node.
+        said: parameter -> keys and values.
+    """
     own = sim.get("parameters") or {}
-    here = {name: own[name] | {"per": by} for name, by in per.items() if isinstance(own.get(name), dict)}
+    here = {name: own[name] | dict(keys) for name, keys in said.items() if isinstance(own.get(name), dict)}
     node = sim | ({"parameters": own | here} if here else {})
-    deeper = {name: by for name, by in per.items() if name not in here}
+    deeper = {name: keys for name, keys in said.items() if name not in here}
     return node | ({"base": written(sim["base"], deeper)} if deeper and isinstance(sim.get("base"), dict) else {})
 
 

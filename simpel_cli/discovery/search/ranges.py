@@ -96,7 +96,8 @@ def translated(old: Search, new: Search, trial: Trial) -> Trial:
         if row in optimum.free:
             k, span = optimum.free.index(row), after.high[row] - after.low[row]
             scale[k] = (before.high[row] - before.low[row]) / span
-            centre[k] = scale[k] * centre[k] + (before.low[row] - after.low[row]) / span
+            mean = np.clip(centre[k], 0.0, 1.0)  # of a Gaussian, which knows no end
+            centre[k] = scale[k] * mean + (before.low[row] - after.low[row]) / span
     both = np.outer(scale, scale)
     return Trial(
         trial.terms,

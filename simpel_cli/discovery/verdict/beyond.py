@@ -60,11 +60,6 @@ def sentence_of(found: Sequence[Beyond]) -> str:
     return f" Outside the range that sim.parameters gives, by {found[0].gain:.0f} nats: {'; '.join(parts)}."
 
 
-def written(sim: dict[str, Any], found: Sequence[Beyond]) -> dict[str, Any]:
-    """Return the `sim:` node whose ranges hold what was found; one that is built on another says so where it is declared."""
-    own = sim.get("parameters") or {}
-    here = {b.name: own[b.name] | {"range": [min(b.range[0], b.low), max(b.range[1], b.high)]}
-            for b in found if isinstance(own.get(b.name), dict)}  # fmt: skip
-    node = sim | ({"parameters": own | here} if here else {})
-    deeper = [b for b in found if b.name not in here]
-    return node | ({"base": written(sim["base"], deeper)} if deeper and isinstance(sim.get("base"), dict) else {})
+def ranges_of(found: Sequence[Beyond]) -> dict[str, dict[str, Any]]:
+    """Return what a `sim:` node has to say of them: ranges that hold what was given and what was found."""
+    return {b.name: {"range": [min(b.range[0], b.low), max(b.range[1], b.high)]} for b in found}
