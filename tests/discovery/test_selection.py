@@ -371,3 +371,15 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
     selection, gates = unwrap(accepted)(search, none, none, options, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]
+
+
+@pytest.mark.parametrize(("formula", "stays"), [(96.0, True), (85.0, False)])
+def test_a_formula_that_explains_nearly_what_a_function_does_keeps_its_name(formula: float, stays: bool) -> None:
+    """The function does better by more than it has to, and the formula earns nothing beside it."""
+    table = Table({"": 0.0, "A": formula, "?": 104.0, "A?": 104.5})
+    functions = [t for t, term in enumerate(table.search.terms) if term.depends_on]
+    table.search.banned -= {functions[0]}
+    found = select(table.search, beginnings=0)
+    assert [table.search.terms[t].effect for t in found.chosen.terms] == (["A"] if stays else [])
+    assert found.remainder is not None
+    assert found.remainder[0].depends_on
