@@ -183,6 +183,9 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
     narrow = narrowed(search, {q.name: (q.low, q.high) for q in declared.params})
     wider = 0.0
     if narrow is not None:
+        given = {q.name: (q.low, q.high) for q in declared.params}
+        own = search.plan.augmented.model.params
+        search.declared = {q.name: given[q.name] for q in own if given.get(q.name, (q.low, q.high)) != (q.low, q.high)}
         wider = selection.chosen.optimum.log_evidence - within(search, narrow, selection.chosen).optimum.log_evidence
         base = within(search, narrow, base)
 

@@ -77,8 +77,12 @@ def test_nothing_makes_up_for_the_range(wide: tuple[Path, dict[str, Any]]) -> No
 
 
 def test_before_is_what_was_declared_and_after_is_the_truth(wide: tuple[Path, dict[str, Any]]) -> None:
-    _, found = wide
-    assert found["parameters"]["b"]["before"]["value"] <= 1.8 + 1e-6
+    folder, found = wide
+    assert 0.8 < found["parameters"]["b"]["before"]["low"] <= found["parameters"]["b"]["before"]["high"] <= 1.8
+    table = pd.read_parquet(folder / "run" / "parameters.parquet").set_index("model")
+    assert set(table["range_low"]) == {0.8}  # as declared, so that the figure shows what lies outside
+    assert set(table["range_high"]) == {1.8}
+    assert table.loc["before", "high"] <= 1.8 < table.loc["after", "low"]
     error = found["error"]
     assert error["after"]["free_run"]["v"] < 0.1 * error["before"]["free_run"]["v"]
     assert error["grows"] == []

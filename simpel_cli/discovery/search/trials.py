@@ -94,6 +94,7 @@ class Search:
         self.ones = np.ones(len(plan.windows.episode))
         self.tried = 0
         self.budget = Budget()
+        self.declared: dict[str, tuple[float, float]] = {}  # ranges of parameters that are wider here than was declared
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
         self.asked: dict[tuple[Any, ...], Stage] = {}  # what was added to what already

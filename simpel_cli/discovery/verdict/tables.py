@@ -8,7 +8,7 @@ import numpy as np
 from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
-from simpel_cli.discovery.verdict.verdict import interval_of
+from simpel_cli.discovery.verdict.verdict import before_of, interval_of
 from simpel_cli.filtering.errors_ahead import SETTLE, Assessment, in_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import Windows, pieces
@@ -175,7 +175,7 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
     Parameters of effects have no `before`, and `effect` says whose they are.
     """
     own = [
-        (q.name, "", q.unit, q.low, q.high, i)
+        (q.name, "", q.unit, *search.declared.get(q.name, (q.low, q.high)), i)
         for i, q in enumerate(search.plan.augmented.model.params)
         if q.role not in (SPREAD, MEMBER)
     ]
@@ -186,7 +186,7 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
     ]
     rows = [
         {"parameter": name, "effect": effect, "unit": unit, "model": model, "range_low": low, "range_high": high}
-        | interval_of(search, trial, row)
+        | (before_of if model == "before" else interval_of)(search, trial, row)
         for name, effect, unit, low, high, row in own + added
         for model, trial in (("before", selection.base), ("after", selection.chosen))
         if not (effect and model == "before")

@@ -146,6 +146,12 @@ def interval_of(search: Search, trial: Trial, row: int, z: float = Z90) -> dict[
     }
 
 
+def before_of(search: Search, base: Trial, row: int) -> dict[str, float]:
+    """Return `interval_of` of a parameter of the simulator as it was declared: nothing of it lies outside its range."""
+    ends = search.declared.get(search.plan.augmented.params[row].name, (-np.inf, np.inf))
+    return {name: float(np.clip(value, *ends)) for name, value in interval_of(search, base, row).items()}
+
+
 def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
     term = search.terms[selection.chosen.terms[i]]
     rows = search.rows[selection.chosen.terms[i]]
@@ -196,7 +202,7 @@ def _labels(effect: dict[str, Any], members: list[dict[str, Any]]) -> list[str]:
 
 def _parameters(search: Search, base: Trial, chosen: Trial) -> dict[str, Any]:
     return {
-        q.name: {"before": interval_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
+        q.name: {"before": before_of(search, base, i), "after": interval_of(search, chosen, i), "unit": q.unit}
         for i, q in enumerate(search.plan.augmented.model.params)
         if q.role not in (SPREAD, MEMBER)
     }

@@ -139,7 +139,7 @@ def draw_parameters(found: dict[str, Any], path: Path) -> Any:
     if not table or not len(table["parameter"]):
         return None
     keys = distinct(zip(table["parameter"], table["effect"], strict=True))
-    figure, (axis,) = new_figure(1, 9.0, 0.9 + 0.42 * len(keys))
+    figure, (axis,) = new_figure(1, 10.0, 0.9 + 0.42 * len(keys))
     labelled: set[str] = set()
     for place, key in enumerate(keys):
         rows = [i for i, k in enumerate(zip(table["parameter"], table["effect"], strict=True)) if k == key]
@@ -158,7 +158,7 @@ def draw_parameters(found: dict[str, Any], path: Path) -> Any:
             texts.append(with_interval(ends[1], ends[0], ends[2]))
         unit = table["unit"][rows[0]]
         axis.text(
-            1.11, place, " → ".join(texts) + (f" {unit}" if unit not in ("", "1") else ""), va="center", fontsize=8
+            1.17, place, " → ".join(texts) + (f" {unit}" if unit not in ("", "1") else ""), va="center", fontsize=8
         )
         for at, value, side in ((0, low, "right"), (1, high, "left")):
             axis.text(
@@ -173,7 +173,7 @@ def draw_parameters(found: dict[str, Any], path: Path) -> Any:
     names = [name if not effect else f"{name}  ({effect.replace('_', ' ')})" for name, effect in keys]
     axis.set_yticks(range(len(keys)), names, fontsize=8.5)
     axis.tick_params(axis="y", pad=22, length=0)
-    axis.set_xlim(-0.06, 1.8)
+    axis.set_xlim(-0.06, 2.15)
     axis.set_ylim(len(keys) - 0.5, -0.5)
     axis.set_xticks([])
     axis.spines[["left", "bottom"]].set_visible(False)
