@@ -25,6 +25,7 @@ MOST_BYTES = 2e9  # of one worker, after which it forgets its programs
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_default_matmul_precision", "highest")  # as `simpel_cli.runs.settings.configure` does
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # compiled programs are shared between tests, workers and runs

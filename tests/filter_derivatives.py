@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simpel_cli.filtering.likelihood.filter import Moving
 from simpel_cli.filtering.likelihood.track import Track
 from simpel_cli.filtering.setup import Setup
 
@@ -34,20 +33,26 @@ def check_derivatives(
     p, noise = coordinates.physical(at)
     track, held = plan.rule.track(p, noise, y, ok, u, start, spread)
 
-    def louder(z: jax.Array) -> Pair:
-        return plan.rule.louder(coordinates.physical(z)[1], track, held, ok, spread)
+    ways, pushes = jax.jit(plan.rule.pushes)(p, jnp.arange(n_p + 1), track, held, u)  # beyond the last one: padding
 
-    def moved(z: jax.Array, row: jax.Array) -> Pair:
-        p = coordinates.physical(z)[0]
-        moving = Moving(p, row, p[jnp.minimum(row, n_p - 1)])
-        return plan.rule.moved(moving, noise, track, held, y, ok, u, start, spread)
+    def louder(z: jax.Array) -> Pair:
+        return plan.rule.shifted(p, coordinates.physical(z)[1], track, held, ok, spread, ways, None, jnp.zeros(()))
+
+    def moved(by: jax.Array, row: jax.Array) -> Pair:
+        push = jax.tree.map(lambda a: a[row], pushes)
+        return plan.rule.shifted(p, noise, track, held, ok, spread, ways, push, by)
 
     @jax.jit
     def exactly(z: jax.Array) -> Pair:
         other, _ = plan.rule.track(*coordinates.physical(z), y, ok, u, start, spread)
         return other.innovation, other.variance
 
-    slope = jax.jit(lambda step, row: jax.jvp(lambda z: moved(z, row), (at,), (step,))[1])
+    @jax.jit
+    def slope(step: jax.Array, row: jax.Array) -> Pair:
+        speed = jax.jvp(lambda z: coordinates.physical(z)[0], (at,), (step,))[1]
+        by = jnp.where(row < n_p, speed[jnp.minimum(row, n_p - 1)], 1.0)
+        return jax.jvp(lambda by: moved(by, row), (jnp.zeros(()),), (by,))[1]
+
     for i in range(n_p + n_r + n_q):
         step = jnp.zeros(len(at)).at[i].set(1.0)
         found = slope(step, jnp.asarray(i)) if i < n_p else jax.jvp(louder, (at,), (step,))[1]

@@ -68,6 +68,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     began, directory = time.perf_counter(), manifest.directory
     study = open_study(declared, data_folder, whole=False)
     refuse_untested(study.recording)
+    manifest.facts["device"] = str(study.device)
     manifest.add_inputs(study.recording.files)
     if not isinstance(study.system.source, Model):
         raise ConfigError(

@@ -150,8 +150,8 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
     a, b = jnp.asarray(system.a), jnp.asarray(system.b)
     rule = Filter(
         track=system.track,
-        moved=pytest.fail,
-        louder=pytest.fail,
+        pushes=pytest.fail,
+        shifted=pytest.fail,
         flow=lambda p, x, u: a @ x + b + 0.0 * p[0] + 0.0 * jnp.sum(u),
         measure=lambda p, x, u: x,
         read=lambda p, before, u_before, x, u: x,

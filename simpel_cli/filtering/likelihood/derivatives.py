@@ -1,11 +1,10 @@
-"""A model's functions with their derivative in the state, and what they do when the state or one parameter moves.
+"""A model's functions at many points at once, with their derivatives in the state, the inputs and every parameter.
 
-Left to itself, XLA works out every sine anew for every direction of a derivative. Here CasADi differentiates, the
-derivatives are made once per point, and a direction costs a few products with the structural nonzeros.
+CasADi differentiates: left to itself, XLA works out every sine anew for every direction of a derivative.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi
 import jax
@@ -16,40 +15,53 @@ from jaxtyping import Array, Float, Int
 from simpel_cli.dynamics.casadi_jax import checked, to_jax_rows
 from simpel_cli.filtering.likelihood.augmented import Augmented
 
+NAMES = ["x", "u", "p"]
+RATES, SENSORS = 0, 1  # results of a model's function
 
-class Moving(NamedTuple):
-    """Parameters of a model, of which at most one moves in the direction of a derivative.
+
+class Slopes(NamedTuple):
+    """Derivatives of n results of a function at points, the trailing axes.
 
     Args:
-        p: (dp, ...) all of them. The model's own derivatives in it are not followed, those of delays and lags are.
-        row: (...) of p that moves; a number beyond the last row: none.
-        value: (...) its value: derivatives in it are followed.
+        by_x: in the states.
+        by_u: in the inputs.
+        by_p: in the parameters, those that act on the same results in one table.
     """
 
-    p: Float[Array, "dp ..."]
-    row: Int[Array, "..."]
-    value: Float[Array, "..."]
+    by_x: Float[Array, "n nx ..."]
+    by_u: Float[Array, "n nu ..."]
+    by_p: tuple[Float[Array, "rows columns ..."], ...]
 
 
-def still(p: Float[Array, "dp ..."]) -> Moving:
-    """Parameters of which none moves."""
-    points = p.shape[1:]
-    return Moving(p, jnp.full(points, p.shape[0]), jnp.zeros(points, p.dtype))
+class Differentiated(NamedTuple):
+    """A function and its derivatives.
+
+    Args:
+        slopes: (x, u, p) -> Slopes, where x, u and p are (nx, ...), (nu, ...) and (dp, ...) at the same points.
+        along: (slopes, row) -> derivative in p[row], (n, ...); row: (...) at the last axes of the points, one beyond the last
+            row of p: 0.
+    """
+
+    slopes: Callable[[Array, Array, Array], Slopes]
+    along: Callable[[Slopes, Int[Array, "..."]], Float[Array, "n ..."]]
 
 
-Slope = Callable[[Array, Array, Array], tuple[Array, Array]]
-Value = Callable[[Array, Array, Moving], Array]
-NAMES = ["x", "u", "p"]
+def value(augmented: Augmented, of: int) -> Callable[[Array, Array, Array], Array]:
+    """Return (x, u, p) -> one result of the model's function, (n, ...); of: RATES or SENSORS."""
+    x, u, p = _symbols(augmented)
+    result = casadi.cse([casadi.densify(augmented.function(x, u, p)[of])])
+    program = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], result, NAMES, ["v"])))
+    return lambda x, u, p: program(x, u, p)[0]
 
 
-def with_slope(augmented: Augmented, of: int) -> Slope:
+def with_slope(augmented: Augmented, of: int) -> Callable[[Array, Array, Array], tuple[Array, Array]]:
     """Return (x, u, p) -> one result of the model's function, (n, ...), and its derivative in x, (n, nx, ...).
 
     Args:
         augmented: model with candidates.
-        of: 0 for the rates, 1 for the sensors.
+        of: RATES or SENSORS.
     """
-    x, u, p = (augmented.function.sx_in(i) for i in range(3))
+    x, u, p = _symbols(augmented)
     result = augmented.function(x, u, p)[of]
     n, nx = result.numel(), x.numel()
     values = casadi.densify(casadi.vertcat(result, casadi.vec(casadi.jacobian(result, x).T)))
@@ -67,61 +79,50 @@ def with_slope(augmented: Augmented, of: int) -> Slope:
     return at
 
 
-def movable(augmented: Augmented, of: int, *, slope: bool = False) -> Value:
-    """Return (x, u, moving) -> one result of the model's function, (n, ...), to be differentiated along a direction.
+def differentiated(augmented: Augmented, of: int, *, slope: bool = False) -> Differentiated:
+    """Return the derivatives of one result of the model's function.
 
     Args:
         augmented: model with candidates.
-        of: 0 for the rates, 1 for the sensors.
-        slope: return its derivative in x instead, row by row, (n nx, ...).
+        of: RATES or SENSORS.
+        slope: of its derivative in x instead, row by row: n nx results.
     """
-    x, u, p = (augmented.function.sx_in(i) for i in range(3))
+    x, u, p = _symbols(augmented)
     result = augmented.function(x, u, p)[of]
     result = casadi.densify(casadi.vec(casadi.jacobian(result, x).T) if slope else result)
     in_x, in_u, in_p = (casadi.jacobian(result, v) for v in (x, u, p))
-    blocks = _blocks(_places(in_p))
-    in_p = casadi.vertcat(*(casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks))
-    own = _finite if slope else lambda v: v
-    plain = jax.jit(to_jax_rows(casadi.Function("value", [x, u, p], casadi.cse([result]), NAMES, ["v"])))
-    slopes = casadi.cse([result, in_x, in_u, in_p])
-    every = to_jax_rows(casadi.Function("slopes", [x, u, p], slopes, NAMES, ["v", "by_x", "by_u", "by_p"]))
+    blocks = _blocks(in_p.sparsity())
+    tables = [casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks]
+    outs = [*(casadi.densify(casadi.vec(a.T)) for a in (in_x, in_u)), *tables]
+    names = [f"o{k}" for k in range(len(outs))]
+    program = jax.jit(to_jax_rows(casadi.Function("slopes", [x, u, p], casadi.cse(outs), NAMES, names)))
+    n, nx, nu, dp = result.numel(), x.numel(), u.numel(), p.numel()
 
-    @jax.jit
-    def all_of(x: Array, u: Array, p: Array) -> tuple[Array, ...]:
-        v, *slopes = every(x, u, p)
-        return own(v), *map(_finite, slopes)
+    def slopes(x: Array, u: Array, p: Array) -> Slopes:
+        by_x, by_u, *by_p = (_finite(a) for a in program(x, u, p))
+        points = x.shape[1:]
+        tables = (a.reshape(len(b.rows), len(b.columns), *points) for a, b in zip(by_p, blocks, strict=True))
+        return Slopes(by_x.reshape(n, nx, *points), by_u.reshape(n, nu, *points), tuple(tables))
 
-    places_x, places_u = _places(in_x), _places(in_u)
-
-    @jax.custom_jvp
-    def value(x: Array, u: Array, p: Array, row: Array, moving: Array) -> Array:
-        return own(plain(x, u, p)[0])
-
-    @value.defjvp
-    def _(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-        x, u, p, row, _ = primals
-        tx, tu, _, _, moved_by = tangents
-        # without the barrier XLA fuses the expressions into every direction, and works them out again for each
-        v, by_x, by_u, by_p = jax.lax.optimization_barrier(all_of(x, u, p))
-        sums: list[Any] = [0.0] * v.shape[0]
-        for places, slope, tangent in ((places_x, by_x, tx), (places_u, by_u, tu)):
-            for k, (i, j) in enumerate(places):
-                sums[i] = sums[i] + slope[k] * tangent[j]
-        begin = 0
-        for block in blocks:
-            shape = len(block.rows), len(block.columns)
-            table = by_p[begin : begin + shape[0] * shape[1]].reshape(*shape, *p.shape[1:])
-            begin += shape[0] * shape[1]
-            place = np.full(p.shape[0] + 1, -1)  # the last one is the padding, which moves nothing
-            place[block.columns] = np.arange(shape[1])
-            at = jnp.asarray(place)[jnp.minimum(row, p.shape[0])]
+    def along(slopes: Slopes, row: Array) -> Array:
+        points = slopes.by_x.shape[2:]
+        rows: list[Array] = [jnp.zeros(points, slopes.by_x.dtype)] * n
+        wide = row.reshape(*(1,) * (len(points) - row.ndim), *row.shape)
+        for block, table in zip(blocks, slopes.by_p, strict=True):
+            place = np.full(dp + 1, -1)  # a row beyond the last moves nothing
+            place[block.columns] = np.arange(len(block.columns))
+            at = jnp.asarray(place)[jnp.minimum(wide, dp)]
             column = jnp.take_along_axis(table, jnp.maximum(at, 0)[None, None], axis=1)[:, 0]
-            step = jnp.where(at >= 0, moved_by, 0.0)
             for k, i in enumerate(block.rows):
-                sums[i] = sums[i] + column[k] * step
-        return v, jnp.stack([jnp.broadcast_to(s, v.shape[1:]) for s in sums])
+                rows[i] = rows[i] + jnp.where(at >= 0, column[k], 0.0)
+        return jnp.stack(rows)
 
-    return lambda x, u, given: value(x, u, jax.lax.stop_gradient(given.p), given.row, given.value)
+    return Differentiated(slopes, along)
+
+
+def _symbols(augmented: Augmented) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
+    x, u, p = (augmented.function.sx_in(i) for i in range(3))
+    return x, u, p
 
 
 def _finite(slopes: Array) -> Array:
@@ -136,19 +137,13 @@ class _Block(NamedTuple):
     columns: list[int]
 
 
-def _blocks(places: list[tuple[int, int]]) -> list[_Block]:
+def _blocks(sparsity: casadi.Sparsity) -> list[_Block]:
     """Gather parameters by the results that they act on: most act on one, and all other rows would be zeros."""
+    columns = np.repeat(np.arange(sparsity.size2()), np.diff(sparsity.colind())).tolist()
     rows_of: dict[int, set[int]] = {}
-    for i, j in places:
+    for i, j in zip(sparsity.row(), columns, strict=True):
         rows_of.setdefault(j, set()).add(i)
     groups: dict[frozenset[int], list[int]] = {}
     for j, rows in sorted(rows_of.items()):
         groups.setdefault(frozenset(rows), []).append(j)
     return [_Block(sorted(rows), columns) for rows, columns in groups.items()]
-
-
-def _places(matrix: casadi.SX) -> list[tuple[int, int]]:
-    """Row and column of every structural nonzero, in CasADi's order."""
-    sparsity = matrix.sparsity()
-    rows, columns = sparsity.row(), np.repeat(np.arange(matrix.shape[1]), np.diff(sparsity.colind()))
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True)]

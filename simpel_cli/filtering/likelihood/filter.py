@@ -11,15 +11,10 @@ Rows need not be equally far apart, nor values be measured at their row: behind 
 row, in dt, and how long before its row each value was measured. A measurement of weight w has the noise R/w: one that lies far
 off costs itself little and is not thrown away.
 
-Derivatives do without second derivatives inside the integrator. Where a noise moves they are exact. Where a parameter of a
-small model moves, the Jacobian of a row follows to second order in dt. A large model holds its gains then, as the innovations
-form of a prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
-
 All arrays may have trailing axes for many windows and hypotheses at once: the innermost loops then run over contiguous
 numbers.
 
-Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004); Ljung
-(1999), System identification, ch. 7.
+Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004).
 """
 
 from collections import OrderedDict
@@ -33,14 +28,16 @@ from jaxtyping import Array
 from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.dynamics.integrate import at_stages
 from simpel_cli.filtering.likelihood.augmented import Augmented
-from simpel_cli.filtering.likelihood.derivatives import Moving, Value, movable, still, with_slope
+from simpel_cli.filtering.likelihood.clock import at_row, early_of, pace_of
+from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
+from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
+from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, shifted_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
-SMALL = 3  # states of a model whose covariance follows the parameters
 _KEPT: OrderedDict[tuple, Filter] = OrderedDict()
 MOST_KEPT = (
     16  # filters; searches of one process that differ in their measurements only share what was traced and compiled
@@ -72,10 +69,8 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
 def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     model = augmented.model
     dt, nx, ny, nu = model.dt, len(model.states), len(augmented.measured), len(model.inputs)
-    rates, sensors = (_of_inputs(with_slope(augmented, i), nu) for i in (0, 1))
-    moving_rates, moving_sensors = (_of_inputs(movable(augmented, i), nu) for i in (0, 1))
-    small = nx <= SMALL  # of a large one the second derivatives are not even made
-    bend = _of_inputs(movable(augmented, 0, slope=True), nu) if small else None
+    rates, sensors = (_of_inputs(with_slope(augmented, of), nu) for of in (RATES, SENSORS))
+    plain_rates = _of_inputs(value(augmented, RATES), nu)
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
@@ -89,10 +84,6 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         for signal, row in rows:
             values[signal] = values[signal] + p[row]
         return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
-
-    def pace_of(u: Array) -> Array | None:
-        """Return the step to the next row, in dt; u: of a row, (nu, ...) or more; None: it is dt."""
-        return u[nu] if u.shape[0] > nu else None
 
     def inputs(p: Array, u: Array) -> Array:
         """Return the inputs of every substep, and behind them what stands behind the inputs of a row."""
@@ -119,73 +110,55 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     def length(u: Array, axes: int = 1) -> Array | float:
         """Return the length of a substep, s, for a value with so many axes of its own."""
-        pace = pace_of(u)
+        pace = pace_of(u, nu)
         return dt / substeps if pace is None else (dt / substeps * pace).reshape((1,) * axes + pace.shape)
 
     def in_stages(stage: Callable[..., Any], carry: Any, u: Array) -> Any:
         """Scan the stages of a substep; what is held is no datum of the scan."""
         if len(u) == 1:
-            return jax.lax.scan(lambda carry, weights: stage(carry, (weights, u[0])), carry, stages)[0]
-        return jax.lax.scan(stage, carry, (stages, at_stages(u)))[0]
+            return jax.lax.scan(lambda carry, weights: stage(carry, (weights, u[0])), carry, stages)
+        return jax.lax.scan(stage, carry, (stages, at_stages(u)))
 
-    def flow(given: Moving, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return the state one row later, and the rate there."""
+    def flow(p: Array, x: Array, u: Array) -> Array:
+        """Return the state one row later."""
 
-        def step(carry: tuple[Array, Array], u: Array) -> tuple[tuple[Array, Array], None]:
-            x, before = carry
-
+        def step(x: Array, u: Array) -> tuple[Array, None]:
             def stage(carry: tuple[Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
                 (total, slope), (weights, u) = carry, now
                 h = length(u)
-                slope = moving_rates(x + h * weights[0] * slope, u, given)
+                slope = plain_rates(x + h * weights[0] * slope, u, p)
                 return (total + h * weights[1] * slope, slope), None
 
-            return in_stages(stage, (x, before), u), None
+            return in_stages(stage, (x, jnp.zeros_like(x)), u)[0][0], None
 
-        return jax.lax.scan(step, (x, jnp.zeros_like(x)), u)[0]
+        return jax.lax.scan(step, x, u)[0]
 
-    def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the state one row later, its derivative in the first state, and the rate there with its derivative."""
+    def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array, Array], Array]:
+        """Return the state one row later, its derivative in the first state, and the rate there with its derivative.
 
-        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, None]:
+        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...).
+        """
+
+        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
             h, h_phi = length(u), length(u, 2)
-            slope, rate_x = apart(rates(x + h * weights[0] * slope, u, p))
+            there = x + h * weights[0] * slope
+            slope, rate_x = apart(rates(there, u, p))
             slope_phi = apart(product(rate_x, apart(phi + h_phi * weights[0] * slope_phi)))
-            after, after_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
-            return (x, phi, after, after_phi, slope, slope_phi, rate_x), None
+            end, end_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
+            return (x, phi, end, end_phi, slope, slope_phi, rate_x), there
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
-        def step(carry: Any, u: Array) -> tuple[Any, None]:
+        def step(carry: Any, u: Array) -> tuple[Any, Array]:
             x, phi, *_ = carry
-            end = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
-            return (end[2], end[3], end[4], end[6]), None
+            end, there = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
+            return (end[2], end[3], end[4], end[6]), there[jnp.array([0, 2, 3])]
 
-        return jax.lax.scan(step, (x, unit, *nothing), u)[0]
+        return jax.lax.scan(step, (x, unit, *nothing), u)
 
     late_ones = bool(sensor_delays or sensor_lags)
-
-    def early_of(u: Array) -> Array | None:
-        """Return how long before its row each value was measured, (ny, ...); u: of a row, (nu, ...) or more; None: at it."""
-        return u[nu + 1 :] if u.shape[0] > nu else None
-
-    def at_row(sensors: Callable[[Array], Any], before: Array, now: Array) -> Any:
-        """Return what sensors read with the input that acts from the row on; measured before it, with what acted until then.
-
-        So a transition reads them, and what is simulated: an output that has a held input follows it at once.
-        """
-        early = early_of(now)
-        if early is None:
-            return sensors(now)
-
-        def one(then: Array, at: Array) -> Array:
-            return jnp.where(
-                (early > 0).reshape(early.shape[:1] + (1,) * (at.ndim - early.ndim) + early.shape[1:]), then, at
-            )
-
-        return jax.tree.map(one, sensors(before), sensors(now))
 
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
@@ -204,9 +177,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         `inputs`: until the row, and from it on.
         """
-        y, prompt = at_row(lambda u: sensors(x, u, p), *inputs)
+        y, prompt = at_row(lambda u: sensors(x, u, p), *inputs, nu)
         read, slope = y, prompt
-        if (early := early_of(inputs[1])) is not None:
+        if (early := early_of(inputs[1], nu)) is not None:
             read = read + jnp.sum(prompt * way_back(early, x, rate, begin), axis=1)
             slope = slope_back(early, prompt, rate_x)
         if late_ones:
@@ -221,32 +194,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             return error
         return jnp.where(along(jnp.array(wraps), error.ndim - 1), jnp.mod(error + jnp.pi, 2 * jnp.pi) - jnp.pi, error)
 
-    def halved(noise: Noise) -> Array:
-        """Half of the process noise of a row: it enters before and after the flow."""
-        return along(jnp.eye(nx), noise.q.ndim - 1) * (noise.q**2 * (dt / 2))[None]
-
-    def of_row(half: Array, pace: Array | None) -> Array:
-        return half if pace is None else half * pace[None, None]
-
-    def counted(weight: Array) -> tuple[Array, Array]:
-        """Return whether measurements of so much weight count, 1 or 0, and by what their variance is larger."""
-        there = weight > 0
-        return jnp.where(there, 1.0, 0.0), 1 / jnp.where(there, weight, 1.0)
-
-    def after(cov: Array, jacobian: Array, half: Array) -> Array:
-        return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
-
-    def of_start(spread: Array) -> Array:
-        return along(jnp.eye(nx), spread.ndim - 1) * (spread**2)[None]
-
     def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
-        u_sub, half = inputs(p, u), halved(noise)
+        u_sub, half = inputs(p, u), of_half_a_row(noise.q, dt)
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
             x, cov, u_before, rate, rate_x, jumps, begin = carry
             y_k, (ok_k, larger), u_k = data
-            predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0])
+            predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0], nu)
             h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), rate, rate_x, jumps, begin)
+            before = (rate, jumps) if late_ones else (None, None)
             if late_ones:
                 jumps = pushed(jumps, prompt, rate, rates(x, u_k[0, 0], p)[0])
             off = wrapped(y_k - h_k)
@@ -263,10 +219,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 x = x + gain * e[None]
                 cov = cov - gain[:, None] * reach[None]
                 x, cov = apart((x, cov))
-            following, jacobian, rate_after, rate_x_after = flow_with_slope(p, x, u_k)
+            (following, jacobian, rate_after, rate_x_after), passed = flow_with_slope(p, x, u_k)
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
-            held = Held(jnp.stack(gains), prompt, rate_x, pace)
+            held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, passed, *before)
             begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
             carry = (
                 following,
@@ -281,103 +237,29 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         first = u_sub[0, 0, 0]
         rate, rate_x = rates(start, first, p)
-        begin = (start, of_start(spread), first, rate, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
+        begin = (start, diagonal(spread), first, rate, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
         return jax.lax.scan(row, begin, (y, counted(ok), u_sub))[1]
 
     def at_rest(u: Array, x: Array, rate: Array) -> tuple[Array, ...]:
         """Return what came before the first row: the same rate."""
-        return () if pace_of(u) is None else (x - dt * rate, rate, jnp.full(x.shape[1:], dt, x.dtype))
-
-    def jacobian_of(bend: Value, given: Moving, jacobian: Array, ends: tuple[Array, Array], u: Array) -> Array:
-        """A row's Jacobian, which follows what moves as exp(A dt) does to second order in dt; A: mean of both ends."""
-        slope = sum((bend(x, u_end, given) for x, u_end in zip(ends, (u[0, 0], u[-1, -1]), strict=True)), jnp.zeros(()))
-        change = substeps * length(u[0, 0], 2) / 2 * (slope - jax.lax.stop_gradient(slope)).reshape(jacobian.shape)
-        return jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
-
-    def moved(
-        given: Moving, noise: Noise, at: Track, held: Held, y: Array, ok: Array, u: Array, start: Array, spread: Array
-    ) -> tuple[Array, Array]:
-        u_sub, half = inputs(given.p, u), halved(noise)
-
-        def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
-            x, cov, u_before, rate, jumps, begin = carry
-            y_k, (ok_k, larger), u_k, at_k, held_k = data
-            early, predicted, pace = early_of(u_k[0, 0]), x, pace_of(u_k[0, 0])
-            read = at_row(lambda u: moving_sensors(x, u, given), u_before, u_k[0, 0])
-            if early is not None:
-                read = read + jnp.sum(held_k.prompt * way_back(early, x, rate, begin), axis=1)
-            if late_ones:
-                late = late_by(given.p)
-                read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
-                jumps = pushed(jumps, held_k.prompt, rate, moving_rates(x, u_k[0, 0], given))
-            slope = at_k.slope
-            if early is not None and bend is not None:
-                rate_x = bend(x, u_before, given).reshape(nx, nx, *x.shape[1:])
-                turned = slope_back(early, held_k.prompt, rate_x)
-                slope = slope + turned - jax.lax.stop_gradient(turned)
-            off = wrapped(y_k - read)
-            errors, variances = [], []
-            for j in range(ny):
-                c, gain, s = slope[j], held_k.gain[j], at_k.variance[j]
-                if small:
-                    reach = product(cov, c[:, None])[:, 0]
-                    s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
-                    gain = (ok_k[j] / s)[None] * reach
-                    cov = cov - gain[:, None] * reach[None]
-                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
-                errors.append(e)
-                variances.append(s)
-                x = x + gain * e[None]
-            following, rate = flow(given, x, u_k)
-            if bend is not None:
-                cov = after(cov, jacobian_of(bend, given, at_k.jacobian, (x, following), u_k), of_row(half, pace))
-            begin = () if pace is None else (x, moving_rates(x, u_k[0, 0], given), dt * pace)
-            return (following, cov, u_k[-1, -1], rate, jumps, begin), (jnp.stack(errors), jnp.stack(variances))
-
-        first = u_sub[0, 0, 0]
-        rate = moving_rates(start, first, given)
-        begin = (start, of_start(spread), first, rate, no_jumps(ny, start), at_rest(first, start, rate))
-        return jax.lax.scan(row, begin, (y, counted(ok), u_sub, at, held))[1]
-
-    def louder(noise: Noise, at: Track, held: Held, ok: Array, spread: Array) -> tuple[Array, Array]:
-        half = halved(noise)
-
-        def row(carry: tuple[Array, Array], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
-            away, cov = carry  # away: from the state of `at`
-            e_k, gain, slope, jacobian, (ok_k, larger), pace = data
-            errors, variances = [], []
-            for j in range(ny):
-                c = slope[j]
-                reach = product(cov, c[:, None])[:, 0]
-                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
-                e = e_k[j] - product(c[None], away[:, None])[0, 0]
-                own = (ok_k[j] / s)[None] * reach
-                errors.append(e)
-                variances.append(s)
-                away = away + own * e[None] - gain[j] * e_k[j][None]
-                cov = cov - own[:, None] * reach[None]
-            away = product(jacobian, away[:, None])[:, 0]
-            return (away, after(cov, jacobian, of_row(half, pace))), (jnp.stack(errors), jnp.stack(variances))
-
-        data = (at.innovation, held.gain, at.slope, at.jacobian, counted(ok), held.pace)
-        return jax.lax.scan(row, (jnp.zeros_like(spread), of_start(spread)), data)[1]
-
-    def plain_flow(p: Array, x: Array, u: Array) -> Array:
-        return flow(still(p), x, u)[0]
+        return () if pace_of(u, nu) is None else (x - dt * rate, rate, jnp.full(x.shape[1:], dt, x.dtype))
 
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
         return sensors(x, u, p)[0]
 
     def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array) -> Array:
         end = u_before[-1, -1]
-        now, slope = at_row(lambda u: sensors(x, u, p), end, u[0, 0])
-        pace, early = pace_of(end), early_of(u[0, 0])
+        now, slope = at_row(lambda u: sensors(x, u, p), end, u[0, 0], nu)
+        pace, early = pace_of(end, nu), early_of(u[0, 0], nu)
         if pace is None or early is None:
             return now
         begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
         return now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
 
-    return Filter(track, moved, louder, plain_flow, plain_measure, read, inputs)
+    of_inputs = sorted({row for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS) for _, row in augmented.operators[kind]})
+    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)
+    shifted = shifted_of(augmented, timing)
+    return Filter(track, pushes_of(augmented, timing), shifted, flow, plain_measure, read, inputs)
 
 
 def _of_inputs(function: Any, nu: int) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
-from simpel_cli.filtering.likelihood.filter import MOST_KEPT, Moving
+from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.track import Filter, Noise
 from simpel_cli.filtering.measurements.windows import Windows
 
@@ -252,24 +252,28 @@ def _evaluate(
     p, noise = physical(z)
     loud = Noise(*map(each, noise))
     track, held = rule.track(each(p), loud, *tiled)
-    _, ok, _, _, spread = tiled
+    _, ok, u, _, spread = tiled
+    index = course.index[:, n_r + n_q :].T
+    rows = each(jnp.where(index < n_p, index, n_p))  # padding is no parameter of the model
+    ways, pushes = rule.pushes(each(p), rows, track, held, u)
+    at_rest = jnp.zeros(spread.shape[1:])
 
-    def moved(z: Array, row: Array) -> tuple[Array, Array]:
-        p = physical(z)[0]
-        value = jnp.take_along_axis(p, jnp.minimum(row, n_p - 1)[None], axis=0)[0]
-        return rule.moved(Moving(each(p), each(row), each(value)), loud, track, held, *tiled)
-
-    def along_one(index: Array) -> tuple[Array, Array]:
+    def along_one(index: Array, push: Any) -> tuple[Array, Array]:
         direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(index)
-        row = jnp.where(index < n_p, index, n_p)  # padding is no parameter of the model
-        return jax.jvp(lambda z: moved(z, row), (z,), (direction,))[1]
+        moved = jax.jvp(lambda z: physical(z)[0], (z,), (direction,))[1]  # by how much the parameter does
+        speed = jnp.take_along_axis(moved, jnp.minimum(index, n_p - 1)[None], axis=0)[0]
+        shifted = lambda by: rule.shifted(each(p), loud, track, held, ok, spread, ways, push, by)  # noqa: E731
+        return jax.jvp(shifted, (at_rest,), (each(speed),))[1]
 
     def along_noise(direction: Array) -> tuple[Array, Array]:
-        louder = lambda z: rule.louder(Noise(*map(each, physical(z)[1])), track, held, ok, spread)  # noqa: E731
+        def louder(z: Array) -> tuple[Array, Array]:
+            noise = Noise(*map(each, physical(z)[1]))
+            return rule.shifted(each(p), noise, track, held, ok, spread, ways, None, at_rest)
+
         return jax.jvp(louder, (z,), (jnp.broadcast_to(direction, z.shape),))[1]
 
     levels = jnp.zeros((n_r + n_q, z.shape[1])).at[jnp.arange(n_r + n_q), n_p + jnp.arange(n_r + n_q)].set(1.0)
-    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one, in_axes=1)(course.index[:, n_r + n_q :])
+    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one)(index, pushes)
     de, ds = (jnp.concatenate(pair) for pair in zip(noises, others, strict=True))
     ok = ok > 0
     s = jnp.where(ok, track.variance, 1.0)

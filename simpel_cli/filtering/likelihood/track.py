@@ -27,12 +27,52 @@ class Track(NamedTuple):
 
 
 class Held(NamedTuple):
-    """What stays as it is where a parameter moves, one row per measured row."""
+    """What the derivatives along a track need of it, one row per measured row."""
 
     gain: Float[Array, "T ny nx ..."]  # 0 where a measurement does not count
     prompt: Float[Array, "T ny nx ..."]  # slope of what the sensors would read, were none late
     rate_x: Float[Array, "T nx nx ..."]  # slope of the rates in the state, at the end of the row before
     pace: Float[Array, "T ..."] | None  # step to the next row, in dt; None: all are dt
+    u: Float[Array, "T substeps K nu ..."]  # as they arrive, and what stands behind the inputs
+    stages: Float[Array, "T substeps 3 nx ..."]  # states at the beginning, in the middle and at the end of a substep
+    rate: Float[Array, "T nx ..."] | None  # at the end of the row before; None: no sensor is late
+    jumps: Float[Array, "T K ny ..."] | None  # of what the sensors read, before the row; None: no sensor is late
+
+
+class Ways(NamedTuple):
+    """How what moves at a row moves on: slopes in the state; None: not needed.
+
+    Args:
+        first: of the rates, at the filtered state and the row's first input.
+        now: of the rates, at the predicted state and the row's first input.
+        end: of the rates, at the end of the row.
+        turn: of the rates' slopes, at the beginning and the end of the row.
+    """
+
+    first: Float[Array, "T nx nx ..."] | None
+    now: Float[Array, "T nx nx ..."] | None
+    end: Float[Array, "T nx nx ..."] | None
+    turn: Float[Array, "T nx nx nx 2 ..."] | None
+
+
+class Pushes(NamedTuple):
+    """What one unit of a parameter adds along a track, where the state is the same; None: not needed.
+
+    Args:
+        state: to the state at the end of the row.
+        reading: to what the sensors read.
+        first: to the rates, where `Ways.first` is their slope; `now` and `end` likewise.
+        turn: to the slope of the rates in the state, mean of both ends of the row.
+        bent: to that slope at the end of the row.
+    """
+
+    state: Float[Array, "T nx ..."]
+    reading: Float[Array, "T ny ..."]
+    first: Float[Array, "T nx ..."] | None
+    now: Float[Array, "T nx ..."] | None
+    end: Float[Array, "T nx ..."] | None
+    turn: Float[Array, "T nx nx ..."] | None
+    bent: Float[Array, "T nx nx ..."] | None
 
 
 class Filter(NamedTuple):
@@ -40,9 +80,10 @@ class Filter(NamedTuple):
 
     Args:
         track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
-        moved: (moving, noise, track, held, y, ok, u, start, spread) -> innovations and variances: to be differentiated in
-            what moves.
-        louder: (noise, track, held, ok, spread) -> innovations and variances: to be differentiated in the noise.
+        pushes: (p, rows, track, held, u) -> Ways, and Pushes of every direction, which leads: of one unit of p[row], for each
+            of rows (D, ...); beyond the last row: nothing.
+        shifted: (p, noise, track, held, ok, spread, ways, push, by) -> innovations and variances, to be differentiated in the
+            noise and in `by`: how much of the push is there, at 0.
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         read: (p, x of the row before, its u of the substeps, x, u of the substeps) -> what is read in a row, of which each
@@ -52,8 +93,8 @@ class Filter(NamedTuple):
     """
 
     track: Callable[..., tuple[Track, Held]]
-    moved: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
-    louder: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
+    pushes: Callable[..., tuple[Ways, Pushes]]
+    shifted: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
     read: Callable[..., Float[Array, " ny"]]

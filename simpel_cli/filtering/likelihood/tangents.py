@@ -1,0 +1,271 @@
+"""Derivatives of innovations and variances along a track of the filter: in the levels of noise, and in parameters.
+
+Along a known track all that moves is linear. What one unit of a parameter adds to rates and readings is worked out at all
+rows at once, at the stages of the integrator; what that leads to is a recursion of small products,
+
+    de[k] = -(H[k] d[k] + reading[k]),    d+[k] = d[k] + K[k] de[k] + dK[k] e[k],    d[k+1] = F[k] d+[k] + state[k]
+
+with the covariance beside it. That follows a level of noise exactly and, in a small model, a parameter, where the Jacobian of
+a row follows to second order in dt. A large model holds its gains where a parameter moves, as the innovations form of a
+prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
+
+Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised); Ljung
+(1999), System identification, ch. 7.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from simpel_cli.filtering.likelihood.augmented import Augmented
+from simpel_cli.filtering.likelihood.clock import chosen, early_of
+from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
+from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
+from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
+from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
+from simpel_cli.filtering.likelihood.small_matrices import product
+from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
+
+SMALL = 3  # states of a model whose covariance follows the parameters
+POINTS = 8192  # at which derivatives are worked out at once: more do not fit a cache
+
+
+class Timing(NamedTuple):
+    """When inputs and readings of an augmented model act.
+
+    Args:
+        dt: s.
+        substeps: Runge-Kutta steps per row.
+        inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu, ...).
+        of_inputs: rows of p that say when an input arrives.
+        late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
+    """
+
+    dt: float
+    substeps: int
+    inputs: Callable[[Array, Array], Array]
+    of_inputs: Sequence[int]
+    late_by: Callable[[Array], tuple[Array, Array]] | None
+
+
+def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:
+    """Return `pushes` of a filter (see `Filter`)."""
+    nx, nu = len(augmented.model.states), len(augmented.model.inputs)
+    rates, sensors = differentiated(augmented, RATES), differentiated(augmented, SENSORS)
+    bend = differentiated(augmented, RATES, slope=True) if nx <= SMALL else None
+    dt, substeps, late_by = timing.dt, timing.substeps, timing.late_by
+
+    def pushes(p: Array, rows: Array, at: Track, held: Held, u: Array) -> tuple[Ways, Pushes]:
+        units = jax.vmap(lambda row: _unit(p, row))(rows)
+        moved = moved_before = None
+        if timing.of_inputs:
+            asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
+            moved = jnp.moveaxis(_along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units, asked), 1, 0)
+            moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
+        late = None if late_by is None else (late_by(p), _along(late_by, p, units, jnp.asarray(True)))
+        before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
+
+        def of(row: tuple[Any, ...]) -> tuple[Ways, Pushes]:
+            return _of_row(p, rows, late, *row)
+
+        size = max(1, POINTS // (3 * substeps * max(1, p[0].size)))
+        ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
+        return ways, jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), found)
+
+    def _of_row(
+        p: Array, rows: Array, late: Any, predicted: Array, held: Held, before: Array, moved: Any, moved_before: Any
+    ) -> tuple[Ways, Pushes]:
+        """Do so for one row; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
+
+        def at_points(of: Differentiated, x: Array, u: Array, moved: Array | None) -> tuple[Slopes, Array]:
+            """Slopes, and what every direction adds, (D, n, ...), at points (nx, ...), (nu, ...), (D, nu, ...)."""
+            own = x.ndim - p.ndim
+            slopes = of.slopes(
+                x, u, jnp.broadcast_to(p.reshape(len(p), *(1,) * own, *p.shape[1:]), (len(p), *x.shape[1:]))
+            )
+            found = jax.vmap(lambda row: of.along(slopes, row))(rows)
+            return slopes, found if moved is None else found + jax.vmap(
+                lambda d: product(slopes.by_u, d[:, None])[:, 0]
+            )(moved)
+
+        u = held.u[:, jnp.array([0, held.u.shape[1] // 2, held.u.shape[1] - 1])]  # (substeps, 3, nu, ...)
+        x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
+        moved_s = None
+        if moved is not None:
+            moved_s = jnp.moveaxis(moved[:, :, jnp.array([0, moved.shape[2] // 2, moved.shape[2] - 1])], 3, 1)
+        slopes, push = at_points(rates, x_s, u_s, moved_s)
+        h = dt / substeps if held.pace is None else dt / substeps * held.pace
+        state = jax.vmap(lambda g: _composed(slopes.by_x, g, h))(push)
+
+        first_of = lambda a: None if a is None else a[:, :, 0, 0]  # noqa: E731
+        early = early_of(held.u[0, 0], nu)
+        first = now = end = push_first = push_now = push_end = None
+        if late is not None or early is not None:
+            slopes_now, push_now = at_points(rates, predicted, u_s[:, 0, 0], first_of(moved_s))
+            first, now, end = slopes.by_x[:, :, 0, 0], slopes_now.by_x, slopes.by_x[:, :, -1, -1]
+            push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
+        reading = at_points(sensors, predicted, u_s[:, 0, 0], first_of(moved_s))[1]
+        if early is not None:
+            then = at_points(sensors, predicted, before, moved_before)[1]
+            reading = jax.vmap(lambda a, b: chosen(early, a, b))(then, reading)
+        if late is not None:
+
+            def shown(late: tuple[Array, Array]) -> Array:
+                assert held.rate is not None
+                assert held.jumps is not None
+                return jnp.sum(held.prompt * back(*late, held.rate, held.rate_x), axis=1) + echo(*late, held.jumps, dt)
+
+            reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
+
+        turn = push_turn = push_bent = None
+        if bend is not None:
+            moved_ends = None if moved_s is None else jax.vmap(_ends)(moved_s)
+            bends, turned = at_points(bend, _ends(x_s), _ends(u_s), moved_ends)
+            squares = turned.reshape(len(rows), nx, nx, *turned.shape[2:])
+            turn = bends.by_x.reshape(nx, nx, nx, *bends.by_x.shape[2:])
+            push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
+            push_bent = squares[:, :, :, 1] if early is not None else None
+        return Ways(first, now, end, turn), Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
+
+    return pushes
+
+
+def shifted_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array, Array]]:
+    """Return `shifted` of a filter (see `Filter`)."""
+    ny, nu, dt, late_by = len(augmented.measured), len(augmented.model.inputs), timing.dt, timing.late_by
+
+    def shifted(
+        p: Array,
+        noise: Noise,
+        at: Track,
+        held: Held,
+        ok: Array,
+        spread: Array,
+        ways: Ways,
+        push: Pushes | None,
+        by: Array,
+    ) -> tuple[Array, Array]:
+        half = of_half_a_row(noise.q, dt)
+        push = jax.tree.map(lambda a: by.reshape(*(1,) * (a.ndim - by.ndim), *by.shape) * a, push)
+        timed = ways.now is not None
+        late = None if late_by is None else late_by(p)
+
+        def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
+            away, cov, rate, jumps, begin, bent = carry  # away: from the state of `at`
+            at_k, held_k, (ok_k, larger), way, more = data
+            early = early_of(held_k.u[0, 0], nu)
+            read = product(held_k.prompt, away[:, None])[:, 0]
+            if more is not None:
+                read = read + more.reading
+            if early is not None:
+                read = read + jnp.sum(held_k.prompt * way_back(early, away, rate, begin), axis=1)
+            if late is not None:
+                read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
+                now = product(way.now, away[:, None])[:, 0]
+                jumps = pushed(jumps, held_k.prompt, rate, now if more is None else now + more.now)
+            slope, turned = at_k.slope, None
+            if early is not None and bent is not None:
+                turned = _turned_back(early, held_k.prompt, held_k.rate_x, bent)
+                slope = slope + turned
+            predicted, learned, errors, variances = away, jnp.zeros_like(away), [], []
+            for j in range(ny):
+                c, e_k, gain = slope[j], at_k.innovation[j], held_k.gain[j]
+                reach = product(cov, c[:, None])[:, 0]
+                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
+                e = e_k - read[j] - product(c[None], (away - predicted)[:, None])[0, 0]
+                if turned is not None:
+                    e = e - product(turned[j][None], learned[:, None])[0, 0]
+                    learned = learned + gain * e_k[None]
+                own = (ok_k[j] / s)[None] * reach
+                errors.append(e)
+                variances.append(s)
+                away = away + own * e[None] - gain * e_k[None]
+                cov = cov - own[:, None] * reach[None]
+            end = product(at_k.jacobian, away[:, None])[:, 0]
+            end = end if more is None else end + more.state
+            jacobian = at_k.jacobian
+            if way.turn is not None:
+                firsts, ends = (jnp.sum(way.turn[:, :, :, k] * x[None, None], axis=2) for k, x in ((0, away), (1, end)))
+                change = (firsts + ends) / 2 if more is None else (firsts + ends) / 2 + more.turn
+                change = change * (dt if held_k.pace is None else dt * held_k.pace)
+                jacobian = jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
+                if early is not None:
+                    bent = ends if more is None else ends + more.bent
+            cov = after(cov, jacobian, of_row(half, held_k.pace))
+            if timed:
+                firsts, rate = product(way.first, away[:, None])[:, 0], product(way.end, end[:, None])[:, 0]
+                if more is not None:
+                    firsts, rate = firsts + more.first, rate + more.end
+                begin = begin if early is None else (away, firsts, dt * held_k.pace)
+            return (end, cov, rate, jumps, begin, bent), (jnp.stack(errors), jnp.stack(variances))
+
+        nothing = jnp.zeros_like(spread)
+        rate = nothing if push is None or push.now is None else push.now[0]  # the first row lies where it begins
+        begin = () if held.pace is None else (-dt * rate, rate, jnp.full(spread.shape[1:], dt, spread.dtype))
+        bent = None
+        if held.pace is not None and ways.turn is not None:
+            bent = jnp.zeros((len(spread), *spread.shape), spread.dtype)  # in the first row it is left out
+        start = (nothing, diagonal(spread), rate, no_jumps(ny, spread) if late is not None else (), begin, bent)
+        return jax.lax.scan(row, start, (at, held, counted(ok), ways, push))[1]
+
+    return shifted
+
+
+def _ends(a: Array) -> Array:
+    """Return the beginning and the end of a row; a: (n, substeps, 3, ...)."""
+    return jnp.stack([a[:, 0, 0], a[:, -1, -1]], axis=1)
+
+
+def _turned_back(early: Array, prompt: Array, rate_x: Array, bent: Array) -> Array:
+    """How the slope of what was read before its row changes as that of the rates does."""
+    return jax.jvp(lambda a: slope_back(early, prompt, a), (rate_x,), (bent,))[1]
+
+
+def _composed(by_x: Array, push: Array, h: Array | float) -> Array:
+    """Return what a push of the rates, (nx, substeps, 3, ...), leads to at the end of the row: the integrator's derivative."""
+
+    def step(moved: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
+        a, g = now
+
+        def rate(k: int, x: Array) -> Array:
+            return product(a[:, :, k], x[:, None])[:, 0] + g[:, k]
+
+        k1 = rate(0, moved)
+        k2 = rate(1, moved + h / 2 * k1)
+        k3 = rate(1, moved + h / 2 * k2)
+        k4 = rate(2, moved + h * k3)
+        return moved + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
+
+    start = jnp.zeros((push.shape[0], *push.shape[3:]), push.dtype)
+    return jax.lax.scan(step, start, (jnp.moveaxis(by_x, 2, 0), jnp.moveaxis(push, 1, 0)))[0]
+
+
+def _unit(p: Array, row: Array) -> Array:
+    """Return the direction in which one parameter moves, (dp, ...); row: (...)."""
+    return (jnp.arange(len(p)).reshape(-1, *(1,) * row.ndim) == row[None]).astype(p.dtype)
+
+
+def _along(function: Callable[[Array], Any], p: Array, units: Array, asked: Array) -> Any:
+    """Derivatives of a function of the parameters in every direction; zeros where they are not asked for."""
+
+    def worked_out() -> Any:
+        return jax.vmap(lambda unit: jax.jvp(function, (p,), (unit,))[1])(units)
+
+    shapes = jax.eval_shape(worked_out)
+    return jax.lax.cond(asked, worked_out, lambda: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes))
+
+
+def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
+    """Map a function over rows, so many at once."""
+    count = len(jax.tree.leaves(rows)[0])
+    parts = -(-count // size)
+    if parts == 1:
+        return jax.vmap(function)(rows)
+    size = -(-count // parts)
+    filled = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], parts * size - count, axis=0)]), rows)
+    apart = jax.tree.map(lambda a: a.reshape(parts, size, *a.shape[1:]), filled)
+    found = jax.lax.map(jax.vmap(function), apart)
+    return jax.tree.map(lambda a: a.reshape(parts * size, *a.shape[2:])[:count], found)
