@@ -13,6 +13,7 @@ from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.track import Filter, Track
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.filtering.setup import Setup
+from simpel_cli.runs.programs import Program
 
 BLOCKS = 10  # of a test window, where there are few episodes
 RAN_AWAY = 1e3  # times the other model's error, where a model has none
@@ -169,16 +170,17 @@ def results(assessment: Assessment, measured: tuple[str, ...], rows: float) -> d
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Any:
-    return jax.jit(jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0)))
+def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Program:
+    every = jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0))
+    return Program(every, f"errors {horizon} ahead of {rule.name} {layout}", (Track,))
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _free_program(rule: Filter, layout: tuple[Any, ...]) -> Any:
+def _free_program(rule: Filter, layout: tuple[Any, ...]) -> Program:
     # what is not returned is not computed
     one = lambda *given: _window(rule, layout, 1, *given)[2]  # noqa: E731
     per_window = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, 0))
-    return jax.jit(jax.vmap(per_window, in_axes=(None, 0, *[None] * 5)))
+    return Program(jax.vmap(per_window, in_axes=(None, 0, *[None] * 5)), f"free runs of {rule.name} {layout}")
 
 
 def _window(

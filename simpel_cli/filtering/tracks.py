@@ -13,6 +13,7 @@ from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.track import Filter, Track
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
+from simpel_cli.runs.programs import Program
 
 
 @runtime_checkable
@@ -42,8 +43,9 @@ class Tracks:
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _program(rule: Filter, layout: tuple[Any, ...]) -> Any:
-    return jax.jit(jax.vmap(partial(_window, rule, layout), in_axes=(None, None, 0, 0, 0, 0, 0)))
+def _program(rule: Filter, layout: tuple[Any, ...]) -> Program:
+    every = jax.vmap(partial(_window, rule, layout), in_axes=(None, None, 0, 0, 0, 0, 0))
+    return Program(every, f"track of {rule.name} {layout}", (Track,))
 
 
 def _window(rule: Filter, layout: tuple[Any, ...], bounds: tuple[Array, ...], z: Array, *window: Array) -> Track:

@@ -149,6 +149,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
     """Latent force by the class that a search uses, with stand-ins for the model."""
     a, b = jnp.asarray(system.a), jnp.asarray(system.b)
     rule = Filter(
+        name="linear",
         track=system.track,
         pushes=pytest.fail,
         shifted=pytest.fail,

@@ -17,6 +17,7 @@ numbers.
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8; Kristensen, Madsen and Jorgensen (2004).
 """
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -59,7 +60,8 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
         substeps, lead,
     )  # fmt: skip
     if key not in _KEPT:
-        _KEPT[key] = _filter_of(augmented, substeps, lead)
+        name = hashlib.sha256(repr(key).encode()).hexdigest()
+        _KEPT[key] = _filter_of(augmented, substeps, lead)._replace(name=name)
         while len(_KEPT) > MOST_KEPT:
             _KEPT.popitem(last=False)
     _KEPT.move_to_end(key)
@@ -259,7 +261,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     of_inputs = sorted({row for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS) for _, row in augmented.operators[kind]})
     timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)
     shifted = shifted_of(augmented, timing)
-    return Filter(track, pushes_of(augmented, timing), shifted, flow, plain_measure, read, inputs)
+    return Filter("", track, pushes_of(augmented, timing), shifted, flow, plain_measure, read, inputs)
 
 
 def _of_inputs(function: Any, nu: int) -> Any:

@@ -25,6 +25,7 @@ from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.track import Filter, Noise
 from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.runs.programs import Program
 
 LEAST_CURVATURE = 12.0
 AT_BOUND = 1e-4
@@ -114,9 +115,9 @@ class Fitter:
         waiting = np.arange(len(hypotheses))
         while waiting.size:
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
-            # the first call compiles: not twice side by side
-            threads = self._threads.map if self._program._cache_size() else map
-            for chunk, ended in zip(chunks, threads(partial(self._advanced, state, most), chunks), strict=True):
+            for chunk, ended in zip(
+                chunks, self._threads.map(partial(self._advanced, state, most), chunks), strict=True
+            ):
                 for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
             waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
@@ -213,8 +214,8 @@ Evaluate = Callable[[Array], tuple[Array, Array, Array]]
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _program(rule: Filter, layout: tuple[Any, ...]) -> Any:
-    return jax.jit(partial(_advance, rule, layout))
+def _program(rule: Filter, layout: tuple[Any, ...]) -> Program:
+    return Program(partial(_advance, rule, layout), f"fit of {rule.name} {layout}", (Course,))
 
 
 def _advance(

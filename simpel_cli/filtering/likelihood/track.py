@@ -79,6 +79,7 @@ class Filter(NamedTuple):
     """The filter of one augmented model; every array may have further axes behind those named here.
 
     Args:
+        name: a digest of all that it is made of: filters of one name are the same.
         track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
         pushes: (p, rows, track, held, u) -> Ways, and Pushes of every direction, which leads: of one unit of p[row], for each
             of rows (D, ...); beyond the last row: nothing.
@@ -92,6 +93,7 @@ class Filter(NamedTuple):
             and end; what stands behind the inputs, behind them.
     """
 
+    name: str
     track: Callable[..., tuple[Track, Held]]
     pushes: Callable[..., tuple[Ways, Pushes]]
     shifted: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]

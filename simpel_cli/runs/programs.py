@@ -1,0 +1,114 @@
+"""Programs that a later process need not trace again.
+
+JAX's compilation cache keeps what XLA makes of a program; to ask it, a process still traces and lowers the program, which takes
+seconds where a model carries dozens of effects. Here the lowered program is kept beside it, by what it is made of: the caller's
+name for that, shapes and types of the arguments, every source file of simpel, the versions of JAX and jaxlib, and the device.
+"""
+
+import contextlib
+import hashlib
+import os
+import threading
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+import simpel_cli
+
+SUFFIX = ".program"
+MOST_KEPT = 200  # files; those that were not used for longest go first
+
+
+class Program:
+    """A jitted function whose lowered form outlives the process where JAX has a compilation cache.
+
+    Args:
+        function: of arrays and trees of them.
+        name: what it is made of: functions of one name are the same. None: it is not kept.
+        trees: named tuples among arguments and results.
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str | None, trees: tuple[type, ...] = ()) -> None:
+        self._plain, self._name, self._trees = jax.jit(function), name, trees
+        self._by_shape: dict[Any, Callable[..., Any]] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it; the first call with arguments of a shape traces it, or finds what an earlier process left."""
+        leaves, tree = jax.tree.flatten(arguments)
+        shape = (tree, tuple((a.shape, str(a.dtype)) for a in map(jax.numpy.asarray, leaves)))
+        if (found := self._by_shape.get(shape)) is None:
+            with self._lock:  # threads of a batch need one program, once
+                if (found := self._by_shape.get(shape)) is None:
+                    found = self._found(arguments, shape)
+                    found(*arguments)
+                    self._by_shape[shape] = found
+        return found(*arguments)
+
+    def _found(self, arguments: Any, shape: Any) -> Callable[..., Any]:
+        folder = _folder()
+        if folder is None or self._name is None:
+            return self._plain
+        for tree in self._trees:
+            _known(tree)
+        made_of = (self._name, str(shape), _sources(), _setting())
+        file = folder / (hashlib.sha256(repr(made_of).encode()).hexdigest()[:40] + SUFFIX)
+        with contextlib.suppress(Exception):  # absent, cut off, or of a format that this version cannot read: made anew
+            kept = jax.jit(export.deserialize(bytearray(file.read_bytes())).call)
+            os.utime(file)
+            return kept
+        try:
+            exported = export.export(self._plain)(*arguments)
+            data = exported.serialize()
+        except (ValueError, NotImplementedError):  # an operation that JAX does not promise to keep
+            return self._plain
+        with contextlib.suppress(OSError):  # no room, or a folder that may only be read
+            _write(file, data)
+        return jax.jit(exported.call)
+
+
+@cache
+def _known(tree: type) -> None:
+    """Tell JAX how a named tuple is written; once."""
+    export.register_namedtuple_serialization(tree, serialized_name=f"{tree.__module__}.{tree.__name__}")
+
+
+@cache
+def _sources() -> str:
+    """Return a digest of all that a program may be traced from."""
+    digest = hashlib.sha256()
+    root = Path(simpel_cli.__file__).parent
+    for folder in (root, root.parent / "simulators"):
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(str(file.relative_to(root.parent)).encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _setting() -> tuple[str, ...]:
+    config: Any = jax.config
+    device = config.jax_default_device or jax.devices()[0]
+    # casadi: which expressions a model comes to
+    versions = (version(name) for name in ("jax", "jaxlib", "casadi"))
+    return (*versions, device.platform, str(config.jax_enable_x64), str(config.jax_default_matmul_precision))
+
+
+def _folder() -> Path | None:
+    """Return where programs are kept: beside JAX's compilation cache; None: that is off."""
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir
+    return Path(folder).parent / "programs" if folder else None
+
+
+def _write(file: Path, data: bytes | bytearray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(f".{os.getpid()}.{threading.get_ident()}")
+    part.write_bytes(data)
+    part.replace(file)
+    kept = sorted(file.parent.glob(f"*{SUFFIX}"), key=lambda f: f.stat().st_mtime, reverse=True)
+    for old in kept[MOST_KEPT:]:
+        old.unlink(missing_ok=True)
