@@ -152,7 +152,7 @@ def force_of(system: Linear, y: np.ndarray) -> Any:
         name="linear",
         track=system.track,
         pushes=pytest.fail,
-        shifted=pytest.fail,
+        slopes=pytest.fail,
         flow=lambda p, x, u: a @ x + b + 0.0 * p[0] + 0.0 * jnp.sum(u),
         measure=lambda p, x, u: x,
         read=lambda p, before, u_before, x, u: x,

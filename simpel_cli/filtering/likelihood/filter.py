@@ -35,7 +35,7 @@ from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, w
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
-from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, shifted_of
+from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 
@@ -260,8 +260,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     of_inputs = sorted({row for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS) for _, row in augmented.operators[kind]})
     timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)
-    shifted = shifted_of(augmented, timing)
-    return Filter("", track, pushes_of(augmented, timing), shifted, flow, plain_measure, read, inputs)
+    return Filter(
+        "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs
+    )
 
 
 def _of_inputs(function: Any, nu: int) -> Any:

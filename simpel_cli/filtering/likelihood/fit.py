@@ -33,6 +33,7 @@ ENOUGH = 0.02  # nats: a step that promises less ends a fit
 MOST_REJECTED = 6  # steps in a row
 MOST = 40  # iterations
 ROUND = 4  # iterations after which fits that have arrived make room for others
+SLOW = 0.1  # nats: a round that gains less, with a step that helped at its end, ends a fit that crawls along a valley
 FIRST_DAMPING = 1e-2
 
 
@@ -114,12 +115,15 @@ class Fitter:
         state = self._begin(hypotheses)
         waiting = np.arange(len(hypotheses))
         while waiting.size:
+            before = state.loss[waiting]
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
             for chunk, ended in zip(
                 chunks, self._threads.map(partial(self._advanced, state, most), chunks), strict=True
             ):
                 for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
+            gained = np.where(np.isfinite(before), before, np.inf) - state.loss[waiting]
+            state.done[waiting] |= (gained < SLOW) & (state.rejected[waiting] == 0)
             waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
         return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]
 
@@ -257,25 +261,21 @@ def _evaluate(
     index = course.index[:, n_r + n_q :].T
     rows = each(jnp.where(index < n_p, index, n_p))  # padding is no parameter of the model
     ways, pushes = rule.pushes(each(p), rows, track, held, u)
-    at_rest = jnp.zeros(spread.shape[1:])
 
-    def along_one(index: Array, push: Any) -> tuple[Array, Array]:
-        direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(index)
-        moved = jax.jvp(lambda z: physical(z)[0], (z,), (direction,))[1]  # by how much the parameter does
-        speed = jnp.take_along_axis(moved, jnp.minimum(index, n_p - 1)[None], axis=0)[0]
-        shifted = lambda by: rule.shifted(each(p), loud, track, held, ok, spread, ways, push, by)  # noqa: E731
-        return jax.jvp(shifted, (at_rest,), (each(speed),))[1]
+    def speed(i: Array) -> Array:
+        """By how much a parameter moves with its unknown."""
+        direction = jax.vmap(lambda i: jnp.zeros(z.shape[1]).at[i].set(1.0))(i)
+        moved = jax.jvp(lambda z: physical(z)[0], (z,), (direction,))[1]
+        return each(jnp.take_along_axis(moved, jnp.minimum(i, n_p - 1)[None], axis=0)[0])
 
-    def along_noise(direction: Array) -> tuple[Array, Array]:
-        def louder(z: Array) -> tuple[Array, Array]:
-            noise = Noise(*map(each, physical(z)[1]))
-            return rule.shifted(each(p), noise, track, held, ok, spread, ways, None, at_rest)
-
-        return jax.jvp(louder, (z,), (jnp.broadcast_to(direction, z.shape),))[1]
+    def louder(direction: Array) -> Noise:
+        moved = jax.jvp(lambda z: physical(z)[1], (z,), (jnp.broadcast_to(direction, z.shape),))[1]
+        return Noise(*map(each, moved))
 
     levels = jnp.zeros((n_r + n_q, z.shape[1])).at[jnp.arange(n_r + n_q), n_p + jnp.arange(n_r + n_q)].set(1.0)
-    noises, others = jax.vmap(along_noise)(levels), jax.vmap(along_one)(index, pushes)
-    de, ds = (jnp.concatenate(pair) for pair in zip(noises, others, strict=True))
+    de, ds = rule.slopes(each(p), loud, jax.vmap(louder)(levels), track, held, ok, ways, pushes)
+    moves = jnp.concatenate([jnp.ones((n_r + n_q, *spread.shape[1:])), jax.vmap(speed)(index)])[:, None, None]
+    de, ds = de * moves, ds * moves
     ok = ok > 0
     s = jnp.where(ok, track.variance, 1.0)
     e = jnp.where(ok, track.innovation, 0.0)

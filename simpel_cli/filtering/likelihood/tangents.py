@@ -1,13 +1,14 @@
 """Derivatives of innovations and variances along a track of the filter: in the levels of noise, and in parameters.
 
 Along a known track all that moves is linear. What one unit of a parameter adds to rates and readings is worked out at all
-rows at once, at the stages of the integrator; what that leads to is a recursion of small products,
+rows at once, at the stages of the integrator (`pushes`). What that leads to is a recursion of small products (`slopes`),
 
-    de[k] = -(H[k] d[k] + reading[k]),    d+[k] = d[k] + K[k] de[k] + dK[k] e[k],    d[k+1] = F[k] d+[k] + state[k]
+    de = -(H d + reading),             d+ = d + K de + dP+ H' e/R,            d_next  = F d+ + state
+    dP+ = (I - K H) dP (I - K H)' + K dR K',    dP_next = F dP+ F' + dF P+ F' + F P+ dF' + dQ
 
-with the covariance beside it. That follows a level of noise exactly and, in a small model, a parameter, where the Jacobian of
-a row follows to second order in dt. A large model holds its gains where a parameter moves, as the innovations form of a
-prediction-error method does: a gain is optimal, so that to first order the likelihood does not change with it.
+since the gain K is optimal: its own change drops out of dP+. A level of noise is followed exactly and, in a small model, a
+parameter, for which the Jacobian F of a row follows to second order in dt. A large model holds its gains where a parameter
+moves, as the innovations form of a prediction-error method does.
 
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised); Ljung
 (1999), System identification, ch. 7.
@@ -22,10 +23,10 @@ from jaxtyping import Array
 
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
-from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
+from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
-from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
+from simpel_cli.filtering.likelihood.sensor_delay import back, echo, pushed
 from simpel_cli.filtering.likelihood.small_matrices import product
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
@@ -49,6 +50,16 @@ class Timing(NamedTuple):
     inputs: Callable[[Array, Array], Array]
     of_inputs: Sequence[int]
     late_by: Callable[[Array], tuple[Array, Array]] | None
+
+
+class _Rows(NamedTuple):
+    """Rows of a track, which lead, with what follows of a change there; `step`: from the row before, s."""
+
+    at: Track
+    held: Held
+    counted: tuple[Array, Array]
+    ways: Ways
+    step: Array | None
 
 
 def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:
@@ -97,7 +108,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         if moved is not None:
             moved_s = jnp.moveaxis(moved[:, :, jnp.array([0, moved.shape[2] // 2, moved.shape[2] - 1])], 3, 1)
         slopes, push = at_points(rates, x_s, u_s, moved_s)
-        h = dt / substeps if held.pace is None else dt / substeps * held.pace
+        h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
         state = jax.vmap(lambda g: _composed(slopes.by_x, g, h))(push)
 
         first_of = lambda a: None if a is None else a[:, :, 0, 0]  # noqa: E731
@@ -133,85 +144,157 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
     return pushes
 
 
-def shifted_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array, Array]]:
-    """Return `shifted` of a filter (see `Filter`)."""
-    ny, nu, dt, late_by = len(augmented.measured), len(augmented.model.inputs), timing.dt, timing.late_by
+class _Moved(NamedTuple):
+    """Derivatives of what goes from row to row; (): not followed.
 
-    def shifted(
-        p: Array,
-        noise: Noise,
-        at: Track,
-        held: Held,
-        ok: Array,
-        spread: Array,
-        ways: Ways,
-        push: Pushes | None,
-        by: Array,
+    Args:
+        state: (nx, ...).
+        cov: (nx, nx, ...).
+        rate: at the end of the row before.
+        jumps: of what the sensors read.
+        begin: state and rate at the row before.
+        bent: slope of the rates at the end of the row before.
+    """
+
+    state: Array
+    cov: Any
+    rate: Any
+    jumps: Any
+    begin: Any
+    bent: Any
+
+
+def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array, Array]]:
+    """Return `slopes` of a filter (see `Filter`)."""
+    nx, ny, nu = len(augmented.model.states), len(augmented.measured), len(augmented.model.inputs)
+    dt, late_by = timing.dt, timing.late_by
+
+    def slopes(
+        p: Array, noise: Noise, louder: Noise, at: Track, held: Held, ok: Array, ways: Ways, pushes: Pushes
     ) -> tuple[Array, Array]:
-        half = of_half_a_row(noise.q, dt)
-        push = jax.tree.map(lambda a: by.reshape(*(1,) * (a.ndim - by.ndim), *by.shape) * a, push)
-        timed = ways.now is not None
         late = None if late_by is None else late_by(p)
+        rows = _Rows(at, held, counted(ok), ways, None if held.pace is None else _shifted(dt * held.pace, dt))
+        half = of_half_a_row(noise.q, dt)
 
-        def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Array, Array]]:
-            away, cov, rate, jumps, begin, bent = carry  # away: from the state of `at`
-            at_k, held_k, (ok_k, larger), way, more = data
-            early = early_of(held_k.u[0, 0], nu)
-            read = product(held_k.prompt, away[:, None])[:, 0]
-            if more is not None:
-                read = read + more.reading
-            if early is not None:
-                read = read + jnp.sum(held_k.prompt * way_back(early, away, rate, begin), axis=1)
-            if late is not None:
-                read = read + jnp.sum(held_k.prompt * back(*late, rate, held_k.rate_x), axis=1) + echo(*late, jumps, dt)
-                now = product(way.now, away[:, None])[:, 0]
-                jumps = pushed(jumps, held_k.prompt, rate, now if more is None else now + more.now)
-            slope, turned = at_k.slope, None
-            if early is not None and bent is not None:
-                turned = _turned_back(early, held_k.prompt, held_k.rate_x, bent)
-                slope = slope + turned
-            predicted, learned, errors, variances = away, jnp.zeros_like(away), [], []
-            for j in range(ny):
-                c, e_k, gain = slope[j], at_k.innovation[j], held_k.gain[j]
-                reach = product(cov, c[:, None])[:, 0]
-                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
-                e = e_k - read[j] - product(c[None], (away - predicted)[:, None])[0, 0]
+        def along(louder: Noise | None, push: Pushes | None) -> tuple[Array, Array]:
+            """Derivatives in one direction: of the noise, or along a push."""
+            of_r, of_half = None, None
+            if louder is not None:
+                of_r = 2 * noise.r * louder.r
+                of_half = jax.jvp(lambda q: of_half_a_row(q, dt), (noise.q,), (louder.q,))[1]
+
+            def row(moved: _Moved, data: tuple[_Rows, Pushes | None]) -> tuple[_Moved, tuple[Array, Array]]:
+                return _after_row(moved, *data, late, half, of_r, of_half)
+
+            return jax.lax.scan(row, _first(rows, push, follows=push is None or nx <= SMALL), (rows, push))[1]
+
+        loud, pushed = (
+            jax.vmap(lambda each: along(each, None))(louder),
+            jax.vmap(lambda each: along(None, each))(pushes),
+        )
+        return jnp.concatenate([loud[0], pushed[0]]), jnp.concatenate([loud[1], pushed[1]])
+
+    def _first(rows: _Rows, push: Pushes | None, *, follows: bool) -> _Moved:
+        """The first row lies where the window begins, at rest."""
+        nothing = jnp.zeros_like(rows.at.mean[0])
+        square = jnp.zeros_like(rows.at.jacobian[0])
+        rate = nothing if push is None or push.now is None else push.now[0]
+        uneven = rows.step is not None
+        return _Moved(
+            nothing,
+            square if follows else (),
+            rate if rows.ways.now is not None else (),
+            () if rows.held.jumps is None else jnp.zeros_like(rows.held.jumps[0]),
+            (-dt * rate, rate) if uneven else (),
+            square if uneven and rows.ways.turn is not None else (),
+        )
+
+    def _after_row(
+        moved: _Moved,
+        row: _Rows,
+        push: Pushes | None,
+        late: tuple[Array, Array] | None,
+        half: Array,
+        of_r: Array | None,
+        of_half: Array | None,
+    ) -> tuple[_Moved, tuple[Array, Array]]:
+        state, cov, rate, jumps, begin, bent = moved
+        at, held, (ok, larger), ways, step = row
+        early, follows = early_of(held.u[0, 0], nu), not isinstance(cov, tuple)
+        read = product(held.prompt, state[:, None])[:, 0]
+        if push is not None:
+            read = read + push.reading
+        if early is not None:
+            read = read + jnp.sum(held.prompt * way_back(early, state, rate, (*begin, _there(step))), axis=1)
+        if late is not None:
+            assert ways.now is not None
+            read = read + jnp.sum(held.prompt * back(*late, rate, held.rate_x), axis=1) + echo(*late, jumps, dt)
+            now = product(ways.now, state[:, None])[:, 0]
+            jumps = pushed(jumps, held.prompt, rate, now if push is None or push.now is None else now + push.now)
+        turned = None
+        if early is not None and ways.turn is not None and follows:
+            turned = _turned_back(early, held.prompt, held.rate_x, bent)
+        predicted, learned, known, of_e, of_s = state, jnp.zeros_like(state), at.predicted_cov, [], []
+        for j in range(ny):
+            c, gain, e, s = at.slope[j], held.gain[j], at.innovation[j], at.variance[j]
+            de = -read[j] - product(c[None], (state - predicted)[:, None])[0, 0]
+            ds = jnp.zeros_like(e) if of_r is None else of_r[j] * larger[j]
+            if turned is not None:
+                de = de - product(turned[j][None], learned[:, None])[0, 0]
+                learned = learned + gain * e[None]
+            state = state + gain * de[None]
+            if (
+                follows
+            ):  # dP+ = dP - v g' - g v' + g g' ds, v = d(P c): the gain is optimal, so that its own change drops out
+                v = product(cov, c[:, None])[:, 0]
+                ds = ds + product(c[None], v[:, None])[0, 0]
                 if turned is not None:
-                    e = e - product(turned[j][None], learned[:, None])[0, 0]
-                    learned = learned + gain * e_k[None]
-                own = (ok_k[j] / s)[None] * reach
-                errors.append(e)
-                variances.append(s)
-                away = away + own * e[None] - gain * e_k[None]
-                cov = cov - own[:, None] * reach[None]
-            end = product(at_k.jacobian, away[:, None])[:, 0]
-            end = end if more is None else end + more.state
-            jacobian = at_k.jacobian
-            if way.turn is not None:
-                firsts, ends = (jnp.sum(way.turn[:, :, :, k] * x[None, None], axis=2) for k, x in ((0, away), (1, end)))
-                change = (firsts + ends) / 2 if more is None else (firsts + ends) / 2 + more.turn
-                change = change * (dt if held_k.pace is None else dt * held_k.pace)
-                jacobian = jacobian + (product(jacobian, change) + product(change, jacobian)) / 2
+                    reach, more = product(known, c[:, None])[:, 0], product(known, turned[j][:, None])[:, 0]
+                    v, ds = v + more, ds + 2 * product(c[None], more[:, None])[0, 0]
+                    known = known - gain[:, None] * reach[None]
+                state = state + (v - gain * ds[None]) * (ok[j] * e / s)[None]
+                both = gain[:, None] * (v - gain * (ds / 2)[None])[None]
+                cov = cov - both - jnp.swapaxes(both, 0, 1)
+            of_e.append(de)
+            of_s.append(ds)
+        end = product(at.jacobian, state[:, None])[:, 0]
+        end = end if push is None else end + push.state
+        if follows:
+            jacobian, noisy = at.jacobian, cov if of_half is None else cov + of_row(of_half, held.pace)
+            cov = product(product(jacobian, noisy), jnp.swapaxes(jacobian, 0, 1))
+            cov = cov if of_half is None else cov + of_row(of_half, held.pace)
+            if ways.turn is not None:
+                firsts, ends = (
+                    jnp.sum(ways.turn[:, :, :, k] * x[None, None], axis=2) for k, x in ((0, state), (1, end))
+                )
+                change = (firsts + ends) / 2
+                change = change if push is None or push.turn is None else change + push.turn
+                change = change * (dt / 2 if held.pace is None else dt / 2 * held.pace[None, None])
+                carried = product(at.cov + of_row(half, held.pace), jnp.swapaxes(jacobian, 0, 1))
+                one = product(product(jacobian, change) + product(change, jacobian), carried)
+                cov = cov + one + jnp.swapaxes(one, 0, 1)
                 if early is not None:
-                    bent = ends if more is None else ends + more.bent
-            cov = after(cov, jacobian, of_row(half, held_k.pace))
-            if timed:
-                firsts, rate = product(way.first, away[:, None])[:, 0], product(way.end, end[:, None])[:, 0]
-                if more is not None:
-                    firsts, rate = firsts + more.first, rate + more.end
-                begin = begin if early is None else (away, firsts, dt * held_k.pace)
-            return (end, cov, rate, jumps, begin, bent), (jnp.stack(errors), jnp.stack(variances))
+                    bent = ends if push is None or push.bent is None else ends + push.bent
+        if ways.first is not None:
+            assert ways.end is not None
+            firsts, rate = product(ways.first, state[:, None])[:, 0], product(ways.end, end[:, None])[:, 0]
+            if push is not None and push.first is not None:
+                firsts, rate = firsts + push.first, rate + _there(push.end)
+            begin = begin if early is None else (state, firsts)
+        return _Moved(end, cov, rate, jumps, begin, bent), (jnp.stack(of_e), jnp.stack(of_s))
 
-        nothing = jnp.zeros_like(spread)
-        rate = nothing if push is None or push.now is None else push.now[0]  # the first row lies where it begins
-        begin = () if held.pace is None else (-dt * rate, rate, jnp.full(spread.shape[1:], dt, spread.dtype))
-        bent = None
-        if held.pace is not None and ways.turn is not None:
-            bent = jnp.zeros((len(spread), *spread.shape), spread.dtype)  # in the first row it is left out
-        start = (nothing, diagonal(spread), rate, no_jumps(ny, spread) if late is not None else (), begin, bent)
-        return jax.lax.scan(row, start, (at, held, counted(ok), ways, push))[1]
+    return slopes
 
-    return shifted
+
+def _there(value: Array | None) -> Array:
+    """Return what is there wherever something else is."""
+    assert value is not None
+    return value
+
+
+def _shifted(pace: Array, first: float) -> Array:
+    """Return the step from the row before, s."""
+    return jnp.concatenate([jnp.full_like(pace[:1], first), pace[:-1]])
 
 
 def _ends(a: Array) -> Array:

@@ -83,8 +83,8 @@ class Filter(NamedTuple):
         track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
         pushes: (p, rows, track, held, u) -> Ways, and Pushes of every direction, which leads: of one unit of p[row], for each
             of rows (D, ...); beyond the last row: nothing.
-        shifted: (p, noise, track, held, ok, spread, ways, push, by) -> innovations and variances, to be differentiated in the
-            noise and in `by`: how much of the push is there, at 0.
+        slopes: (p, noise, louder, track, held, ok, ways, pushes) -> derivatives of innovations and variances, (D, T, ny, ...)
+            each: first in the directions of the noise that `louder` holds, then along the pushes.
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         read: (p, x of the row before, its u of the substeps, x, u of the substeps) -> what is read in a row, of which each
@@ -96,7 +96,7 @@ class Filter(NamedTuple):
     name: str
     track: Callable[..., tuple[Track, Held]]
     pushes: Callable[..., tuple[Ways, Pushes]]
-    shifted: Callable[..., tuple[Float[Array, "T ny"], Float[Array, "T ny"]]]
+    slopes: Callable[..., tuple[Float[Array, "D T ny"], Float[Array, "D T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
     read: Callable[..., Float[Array, " ny"]]
