@@ -22,6 +22,7 @@ from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.likelihood.track import Track
+from simpel_cli.filtering.tracks import Tracks
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # of the process noise of the state that a force acts on
 NUDGE = 1e-4  # of an unknown's range
@@ -96,12 +97,12 @@ class NoiseProfile:
     def _moves(self, z: np.ndarray, innovation: np.ndarray) -> list[np.ndarray]:
         """Change of the innovations per unknown of the chosen model, (W, T, ny) each; 0 where nothing was measured."""
         search, windows = self.search, self.search.plan.windows
-        found = []
+        tracks, found = Tracks(search.plan), []
         for i in (i for i in search.free(self.chosen.terms) if i not in search.noise):
             near = z.copy()
             step = NUDGE if z[i] < 0.5 else -NUDGE
             near[i] += step
-            change = (np.asarray(self.assessor(near, windows).track.innovation) - innovation) / step
+            change = (tracks.track(near, windows).innovation - innovation) / step
             found.append(np.where((windows.ok > 0) & np.isfinite(change), change, 0.0))
         return found
 
