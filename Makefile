@@ -37,7 +37,7 @@ demo: install ## Run the main job (simpel fit experiment=pendulum) and say where
 # most of the time of the tests is XLA's, for programs that run for a moment: 124 s became 92 in two files (cold cache, one core);
 # `make test-slow`, and pytest by itself, compile as users do
 # jaxlib 0.11 no longer knows the second switch, and would not start with it
-NO_EMITTERS = $$($(BIN)/python -c "from importlib.metadata import version as v; print('--xla_cpu_use_fusion_emitters=false' * (v('jaxlib') < '0.11'))")
+NO_EMITTERS = $$($(BIN)/python -c "from importlib.metadata import version as v; print('--xla_cpu_use_fusion_emitters=false' * ([int(n) for n in v('jaxlib').split('.')[:2]] < [0, 11]))")
 QUICK = --xla_backend_optimization_level=0 $(NO_EMITTERS)
 
 test: install ## Run the tests (under 12 minutes on two cores)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.dynamics.transition import OneStep, Transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.priors.gaussian_process import Kernel, SquaredExponential, gram
+from simpel_cli.runs.settings import current_device
 from simulators.model import Quantity
 
 WIDE = 64  # numbers in a transition
@@ -100,7 +101,7 @@ class FunctionPrior(NamedTuple):
             over: entries along the first axis.
             copies: transitions that one entry takes.
         """
-        if self.width <= WIDE or _device().platform != "cpu":
+        if self.width <= WIDE or current_device().platform != "cpu":
             return jax.vmap(run)(over)
         return jax.lax.map(run, over, batch_size=min(max(1, CACHED // (self.width * copies)), over.shape[0]))
 
@@ -210,8 +211,3 @@ def sample_parameters(
     middle, width = ((low + high) / 2)[None], (high - low)[None]
     draws = jnp.where(gaussian[None], middle + width / 4 * normal, low[None] + width * uniform)
     return jnp.where(log[None], jnp.exp(jnp.where(log[None], draws, 0.0)), draws)
-
-
-def _device() -> jax.Device:
-    """Where computations run: `run.device=cpu` on a machine with a GPU is the CPU."""
-    return jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]

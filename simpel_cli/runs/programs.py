@@ -3,6 +3,7 @@
 JAX's compilation cache keeps what XLA makes of a program; to ask it, a process still traces and lowers the program, which takes
 seconds where a model carries dozens of effects. Here the lowered program is kept beside it, by what it is made of: the caller's
 name for that, shapes and types of the arguments, every source file of simpel, the versions of JAX and jaxlib, and the device.
+Constants of a module that a test replaces are no part of that: such a test switches JAX's cache off.
 """
 
 import contextlib
@@ -16,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax import export
 
 import simpel_cli
+from simpel_cli.runs.settings import current_device
 
 SUFFIX = ".program"
+_KNOWING = threading.Lock()
 MOST_KEPT = 200  # files; those that were not used for longest go first
 
 
@@ -41,7 +45,10 @@ class Program:
     def __call__(self, *arguments: Any) -> Any:
         """Call it; the first call with arguments of a shape traces it, or finds what an earlier process left."""
         leaves, tree = jax.tree.flatten(arguments)
-        shape = (tree, tuple((a.shape, str(a.dtype)) for a in map(jax.numpy.asarray, leaves)))
+        kinds = tuple(
+            (*np.shape(a), str(jax.dtypes.result_type(a)), bool(getattr(a, "weak_type", False))) for a in leaves
+        )
+        shape = (tree, kinds, _setting())
         if (found := self._by_shape.get(shape)) is None:
             with self._lock:  # threads of a batch need one program, once
                 if (found := self._by_shape.get(shape)) is None:
@@ -54,21 +61,26 @@ class Program:
         folder = _folder()
         if folder is None or self._name is None:
             return self._plain
-        for tree in self._trees:
-            _known(tree)
-        made_of = (self._name, str(shape), _sources(), _setting())
+        with _KNOWING:
+            for tree in self._trees:
+                _known(tree)
+        made_of = (self._name, str(shape), SOURCES)
         file = folder / (hashlib.sha256(repr(made_of).encode()).hexdigest()[:40] + SUFFIX)
         with contextlib.suppress(Exception):  # absent, cut off, or of a format that this version cannot read: made anew
             kept = jax.jit(export.deserialize(bytearray(file.read_bytes())).call)
-            os.utime(file)
+            with contextlib.suppress(OSError):  # a folder that may only be read
+                os.utime(file)
             return kept
+        # left to itself, export takes the machine's first device, also where computations run on another
+        platforms = ["cpu"] if current_device().platform == "cpu" else None
         try:
-            exported = export.export(self._plain)(*arguments)
+            exported = export.export(self._plain, platforms=platforms)(*arguments)
             data = exported.serialize()
         except (ValueError, NotImplementedError):  # an operation that JAX does not promise to keep
             return self._plain
-        with contextlib.suppress(OSError):  # no room, or a folder that may only be read
-            _write(file, data)
+        if _sources() == SOURCES:  # else they were edited since this process read them
+            with contextlib.suppress(OSError):  # no room, or a folder that may only be read
+                _write(file, data)
         return jax.jit(exported.call)
 
 
@@ -78,7 +90,6 @@ def _known(tree: type) -> None:
     export.register_namedtuple_serialization(tree, serialized_name=f"{tree.__module__}.{tree.__name__}")
 
 
-@cache
 def _sources() -> str:
     """Return a digest of all that a program may be traced from."""
     digest = hashlib.sha256()
@@ -89,12 +100,18 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
+SOURCES = _sources()  # when this process was started, as near as can be
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    return tuple(version(name) for name in ("jax", "jaxlib", "casadi"))  # casadi: which expressions a model comes to
+
+
 def _setting() -> tuple[str, ...]:
     config: Any = jax.config
-    device = config.jax_default_device or jax.devices()[0]
-    # casadi: which expressions a model comes to
-    versions = (version(name) for name in ("jax", "jaxlib", "casadi"))
-    return (*versions, device.platform, str(config.jax_enable_x64), str(config.jax_default_matmul_precision))
+    platform = current_device().platform
+    return (*_versions(), platform, str(config.jax_enable_x64), str(config.jax_default_matmul_precision))
 
 
 def _folder() -> Path | None:
@@ -107,8 +124,12 @@ def _folder() -> Path | None:
 def _write(file: Path, data: bytes | bytearray) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(f".{os.getpid()}.{threading.get_ident()}")
-    part.write_bytes(data)
-    part.replace(file)
+    try:
+        part.write_bytes(data)
+        part.replace(file)
+    except BaseException:  # an interruption, too, leaves no part behind
+        part.unlink(missing_ok=True)
+        raise
     kept = sorted(file.parent.glob(f"*{SUFFIX}"), key=lambda f: f.stat().st_mtime, reverse=True)
     for old in kept[MOST_KEPT:]:
         old.unlink(missing_ok=True)

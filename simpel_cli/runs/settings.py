@@ -4,7 +4,7 @@ import os
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from simpel_cli.errors import ConfigError
 
@@ -87,6 +87,16 @@ def configure(settings: Settings) -> "jax.Device":
         ) from error
     jax.config.update("jax_default_device", device)
     return device
+
+
+def current_device() -> "jax.Device":
+    """Where computations run: `run.device=cpu` on a machine with a GPU is the CPU."""
+    import jax
+
+    config: Any = jax.config
+    device: Any = config.jax_default_device or jax.devices()[0]
+    found: jax.Device = jax.devices(device)[0] if isinstance(device, str) else device
+    return found
 
 
 def cache_directory() -> Path:

@@ -13,6 +13,7 @@ from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import Setup, setup
 from simulators.effects import Expression
+from simulators.model import Declared
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +131,20 @@ def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float) ->
 def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:
     """Exactly in a noise, and in a parameter up to what a row's Jacobian bends within the row."""
     check_derivatives(plan, tuple(jnp.asarray(a[0]) for a in plan.windows[:5]), 1e-6)
+
+
+def test_a_model_without_unknowns_has_levels_of_noise_to_fit() -> None:
+    quantity = {"range": [-3, 3]}
+    known = Declared(
+        "known", dt=DT, states={"s": {"unit": "m", **quantity}, "v": {"unit": "m/s", **quantity}},
+        inputs={"u": {"unit": "V", **quantity}}, parameters={}, dynamics={"s": "v", "v": f"{B}*u - {A}*v"},
+    ).model()  # fmt: skip
+    plan = setup(known, recording(), (), [], 2, kept=frozenset())
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, width=4)
+    n_p, n_r, n_q = plan.coordinates.sizes
+    assert n_p == 0
+    (found,) = fitter([Hypothesis(plan.start, tuple(range(n_r + n_q)), np.ones(len(plan.windows.episode)))])
+    assert found.converged
 
 
 @pytest.mark.slow

@@ -113,6 +113,7 @@ def test_derivatives_follow_the_clock_and_the_weights(weight: float) -> None:
     plan = setup(model(), recording(0.3, True)[0], (), [], 2)
     y, ok, u, start, spread = (a[0] for a in plan.windows.arrays)
     ok = ok.at[2::3].set(weight).at[5, 0].set(0.0)
+    u = u.at[:, 3].max(0.3 * DT)  # v is late in the first row, too: the piece of a cut record begins so
     # the slope of an early value is of second order
     check_derivatives(plan, (y, ok, u, start, spread), 1e-3)
 

@@ -74,6 +74,7 @@ def test_other_shapes_and_names_are_other_programs(folder: Path) -> None:
 
 def test_what_was_made_from_other_sources_is_not_used(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(Traced())
+    monkeypatch.setattr(programs, "SOURCES", "others")
     monkeypatch.setattr(programs, "_sources", lambda: "others")
     edited = Traced()
     run(edited)
@@ -107,3 +108,27 @@ def test_without_a_folder_nothing_is_kept(folder: Path) -> None:
     (folder / "file").write_text("in the way")
     run(Traced())  # no place to write is no error
     run(Traced(), None)
+
+
+def test_sources_that_were_edited_since_are_not_written_under_the_name_of_the_new_ones(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs, "_sources", lambda: "edited")
+    run(Traced())
+    assert not list(folder.glob("*"))
+
+
+def test_nothing_is_left_of_a_file_that_could_not_be_written(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: Path, data: bytes) -> int:
+        self.touch()
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    run(Traced())
+    assert not list(folder.glob("*"))
+
+
+def test_a_number_without_a_type_of_its_own_is_another_program(folder: Path) -> None:
+    program = Program(lambda x, s: x * s, "scaled")
+    x = jnp.ones(2, jnp.float32)
+    assert program(x, jnp.asarray(2.0)).dtype == jax.jit(lambda x, s: x * s)(x, jnp.asarray(2.0)).dtype

@@ -122,9 +122,11 @@ class Fitter:
             ):
                 for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
-            gained = np.where(np.isfinite(before), before, np.inf) - state.loss[waiting]
-            state.done[waiting] |= (gained < SLOW) & (state.rejected[waiting] == 0)
-            waiting = waiting[~state.done[waiting] & (state.iteration[waiting] < most)]
+            both = np.isfinite(before) & np.isfinite(state.loss[waiting])
+            gained = np.subtract(before, state.loss[waiting], where=both, out=np.full(len(waiting), np.inf))
+            # a step that helped with the damping of a refusal is short, whatever is left to gain
+            crawls = (gained < SLOW) & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
+            waiting = waiting[~state.done[waiting] & ~crawls & (state.iteration[waiting] < most)]
         return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]
 
     def on(self, windows: Windows) -> "Fitter":

@@ -82,9 +82,21 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         def of(row: tuple[Any, ...]) -> tuple[Ways, Pushes]:
             return _of_row(p, rows, late, *row)
 
-        size = max(1, POINTS // (3 * substeps * max(1, p[0].size)))
+        size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
         ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
+        if found.bent is not None:
+            start = of_start(p, rows, at.predicted[0], before[0], None if moved_before is None else moved_before[0])
+            found = found._replace(bent=jnp.concatenate([start[None], found.bent[:-1]]))
         return ways, jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), found)
+
+    def of_start(p: Array, rows: Array, x: Array, u: Array, moved: Array | None) -> Array:
+        """Return what every direction adds to the slope of the rates where a window begins, (D, nx, nx, ...)."""
+        assert bend is not None
+        slopes = bend.slopes(x, u, p)
+        found = jax.vmap(lambda row: bend.along(slopes, row))(rows)
+        if moved is not None:
+            found = found + jax.vmap(lambda d: product(slopes.by_u, d[:, None])[:, 0])(moved)
+        return found.reshape(len(rows), nx, nx, *x.shape[1:])
 
     def _of_row(
         p: Array, rows: Array, late: Any, predicted: Array, held: Held, before: Array, moved: Any, moved_before: Any
@@ -153,7 +165,7 @@ class _Moved(NamedTuple):
         rate: at the end of the row before.
         jumps: of what the sensors read.
         begin: state and rate at the row before.
-        bent: slope of the rates at the end of the row before.
+        bent: slope of the rates at the end of the row before, as far as the state there moves it.
     """
 
     state: Array
@@ -233,6 +245,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
             jumps = pushed(jumps, held.prompt, rate, now if push is None or push.now is None else now + push.now)
         turned = None
         if early is not None and ways.turn is not None and follows:
+            bent = bent if push is None or push.bent is None else bent + push.bent
             turned = _turned_back(early, held.prompt, held.rate_x, bent)
         predicted, learned, known, of_e, of_s = state, jnp.zeros_like(state), at.predicted_cov, [], []
         for j in range(ny):
@@ -274,7 +287,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
                 one = product(product(jacobian, change) + product(change, jacobian), carried)
                 cov = cov + one + jnp.swapaxes(one, 0, 1)
                 if early is not None:
-                    bent = ends if push is None or push.bent is None else ends + push.bent
+                    bent = ends
         if ways.first is not None:
             assert ways.end is not None
             firsts, rate = product(ways.first, state[:, None])[:, 0], product(ways.end, end[:, None])[:, 0]

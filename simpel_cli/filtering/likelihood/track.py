@@ -63,7 +63,7 @@ class Pushes(NamedTuple):
         reading: to what the sensors read.
         first: to the rates, where `Ways.first` is their slope; `now` and `end` likewise.
         turn: to the slope of the rates in the state, mean of both ends of the row.
-        bent: to that slope at the end of the row.
+        bent: to that slope at the end of the row before, or where the window begins.
     """
 
     state: Float[Array, "T nx ..."]
