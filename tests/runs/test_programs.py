@@ -119,11 +119,10 @@ def test_sources_that_were_edited_since_are_not_written_under_the_name_of_the_ne
 
 
 def test_nothing_is_left_of_a_file_that_could_not_be_written(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: Path, data: bytes) -> int:
-        self.touch()
+    def full(self: Path, target: Path) -> Path:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "replace", full)
     run(Traced())
     assert not list(folder.glob("*"))
 
