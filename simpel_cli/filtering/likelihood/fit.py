@@ -34,6 +34,7 @@ MOST_REJECTED = 6  # steps in a row
 MOST = 40  # iterations
 ROUND = 4  # iterations after which fits that have arrived make room for others
 SLOW = 0.1  # nats: a round that gains less, with a step that helped at its end, ends a fit that crawls along a valley
+LEGS = 8  # of a step, between which unknowns meet the ends of their ranges
 FIRST_DAMPING = 1e-2
 
 
@@ -330,15 +331,30 @@ def _stepped(now: Course, new_loss: Array, new_gradient: Array, new_fisher: Arra
 
 
 def _proposed(part: Array, gradient: Array, fisher: Array, damping: Array, moves: Array) -> tuple[Array, Array]:
-    """Return the next trial and the gain that the quadratic model promises."""
+    """Return the next trial and the gain that the quadratic model promises, inside the unit box.
+
+    Where a step meets a wall it ends, what met it stays there, and the others are solved for again: every leg gains. Were the
+    step only cut to the box, what is left of it could promise nothing far from any optimum, and end the fit there.
+
+    Reference: Nocedal and Wright (2006), Numerical optimization, section 16.5 (active sets).
+    """
     out = ((part <= 0) & (gradient > 0)) | ((part >= 1) & (gradient < 0)) | ~moves
-    free = ~out
-    matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
-    scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
-    matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
-    step = -jnp.linalg.solve(matrix, jnp.where(free, gradient, 0.0))
-    longest = jnp.max(jnp.abs(step))
-    step = step * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
+
+    def leg(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        step, free = carry
+        matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
+        scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
+        matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
+        own = -jnp.linalg.solve(matrix, jnp.where(free, gradient + fisher @ step, 0.0))
+        longest = jnp.max(jnp.abs(own))
+        own = own * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
+        room = jnp.where(own > 0, 1 - part - step, part + step)
+        share = jnp.where(own != 0, room / jnp.maximum(jnp.abs(own), 1e-300), jnp.inf)
+        least = jnp.minimum(jnp.min(share), 1.0)
+        # a leg that meets no wall is the last one
+        return step + least * own, free & (share > least) & (least < 1)
+
+    step, _ = jax.lax.fori_loop(0, LEGS, leg, (jnp.zeros_like(part), ~out))
     following = jnp.clip(part + step, 0.0, 1.0)
     step = following - part
     return following, -(gradient @ step) - 0.5 * step @ fisher @ step
