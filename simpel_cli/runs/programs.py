@@ -76,7 +76,8 @@ class Program:
         try:
             exported = export.export(self._plain, platforms=platforms)(*arguments)
             data = exported.serialize()
-        except (ValueError, NotImplementedError):  # an operation that JAX does not promise to keep
+        # an operation whose written form JAX does not promise to read again: this process traces it, as every later one will
+        except (ValueError, NotImplementedError):
             return self._plain
         if _sources() == SOURCES:  # else they were edited since this process read them
             with contextlib.suppress(OSError):  # no room, or a folder that may only be read

@@ -74,9 +74,11 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         moved = moved_before = None
         if timing.of_inputs:
             asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
-            moved = jnp.moveaxis(_along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units, asked), 1, 0)
+            moved = jnp.moveaxis(
+                _if(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
+            )
             moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
-        late = None if late_by is None else (late_by(p), _along(late_by, p, units, jnp.asarray(True)))
+        late = None if late_by is None else (late_by(p), _along(late_by, p, units))
         before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
 
         def of(row: tuple[Any, ...]) -> tuple[Ways, Pushes]:
@@ -85,41 +87,22 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
         ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
         if found.bent is not None:
-            start = of_start(p, rows, at.predicted[0], before[0], None if moved_before is None else moved_before[0])
-            found = found._replace(bent=jnp.concatenate([start[None], found.bent[:-1]]))
+            assert bend is not None
+            begin = at.predicted[0], before[0], None if moved_before is None else moved_before[0]
+            start = _at_points(bend, p, rows, *begin)[1]
+            found = found._replace(bent=jnp.concatenate([start.reshape(1, *found.bent.shape[1:]), found.bent[:-1]]))
         return ways, jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), found)
-
-    def of_start(p: Array, rows: Array, x: Array, u: Array, moved: Array | None) -> Array:
-        """Return what every direction adds to the slope of the rates where a window begins, (D, nx, nx, ...)."""
-        assert bend is not None
-        slopes = bend.slopes(x, u, p)
-        found = jax.vmap(lambda row: bend.along(slopes, row))(rows)
-        if moved is not None:
-            found = found + jax.vmap(lambda d: product(slopes.by_u, d[:, None])[:, 0])(moved)
-        return found.reshape(len(rows), nx, nx, *x.shape[1:])
 
     def _of_row(
         p: Array, rows: Array, late: Any, predicted: Array, held: Held, before: Array, moved: Any, moved_before: Any
     ) -> tuple[Ways, Pushes]:
         """Do so for one row; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
-
-        def at_points(of: Differentiated, x: Array, u: Array, moved: Array | None) -> tuple[Slopes, Array]:
-            """Slopes, and what every direction adds, (D, n, ...), at points (nx, ...), (nu, ...), (D, nu, ...)."""
-            own = x.ndim - p.ndim
-            slopes = of.slopes(
-                x, u, jnp.broadcast_to(p.reshape(len(p), *(1,) * own, *p.shape[1:]), (len(p), *x.shape[1:]))
-            )
-            found = jax.vmap(lambda row: of.along(slopes, row))(rows)
-            return slopes, found if moved is None else found + jax.vmap(
-                lambda d: product(slopes.by_u, d[:, None])[:, 0]
-            )(moved)
-
-        u = held.u[:, jnp.array([0, held.u.shape[1] // 2, held.u.shape[1] - 1])]  # (substeps, 3, nu, ...)
+        u = held.u[:, _stages_of(held.u.shape[1])]  # (substeps, 3, nu, ...)
         x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
         moved_s = None
         if moved is not None:
-            moved_s = jnp.moveaxis(moved[:, :, jnp.array([0, moved.shape[2] // 2, moved.shape[2] - 1])], 3, 1)
-        slopes, push = at_points(rates, x_s, u_s, moved_s)
+            moved_s = jnp.moveaxis(moved[:, :, _stages_of(moved.shape[2])], 3, 1)
+        slopes, push = _at_points(rates, p, rows, x_s, u_s, moved_s)
         h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
         state = jax.vmap(lambda g: _composed(slopes.by_x, g, h))(push)
 
@@ -127,12 +110,12 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         early = early_of(held.u[0, 0], nu)
         first = now = end = push_first = push_now = push_end = None
         if late is not None or early is not None:
-            slopes_now, push_now = at_points(rates, predicted, u_s[:, 0, 0], first_of(moved_s))
+            slopes_now, push_now = _at_points(rates, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s))
             first, now, end = slopes.by_x[:, :, 0, 0], slopes_now.by_x, slopes.by_x[:, :, -1, -1]
             push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
-        reading = at_points(sensors, predicted, u_s[:, 0, 0], first_of(moved_s))[1]
+        reading = _at_points(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s))[1]
         if early is not None:
-            then = at_points(sensors, predicted, before, moved_before)[1]
+            then = _at_points(sensors, p, rows, predicted, before, moved_before)[1]
             reading = jax.vmap(lambda a, b: chosen(early, a, b))(then, reading)
         if late is not None:
 
@@ -146,7 +129,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         turn = push_turn = push_bent = None
         if bend is not None:
             moved_ends = None if moved_s is None else jax.vmap(_ends)(moved_s)
-            bends, turned = at_points(bend, _ends(x_s), _ends(u_s), moved_ends)
+            bends, turned = _at_points(bend, p, rows, _ends(x_s), _ends(u_s), moved_ends)
             squares = turned.reshape(len(rows), nx, nx, *turned.shape[2:])
             turn = bends.by_x.reshape(nx, nx, nx, *bends.by_x.shape[2:])
             push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
@@ -310,6 +293,23 @@ def _shifted(pace: Array, first: float) -> Array:
     return jnp.concatenate([jnp.full_like(pace[:1], first), pace[:-1]])
 
 
+def _at_points(
+    of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved: Array | None
+) -> tuple[Slopes, Array]:
+    """Slopes, and what every direction adds, (D, n, ...), at points (nx, ...), (nu, ...), (D, nu, ...)."""
+    own = x.ndim - p.ndim
+    slopes = of.slopes(x, u, jnp.broadcast_to(p.reshape(len(p), *(1,) * own, *p.shape[1:]), (len(p), *x.shape[1:])))
+    found = jax.vmap(lambda row: of.along(slopes, row))(rows)
+    if moved is not None:
+        found = found + jax.vmap(lambda d: product(slopes.by_u, d[:, None])[:, 0])(moved)
+    return slopes, found
+
+
+def _stages_of(count: int) -> Array:
+    """Return where the beginning, the middle and the end of a substep stand among its inputs."""
+    return jnp.array([0, count // 2, count - 1])
+
+
 def _ends(a: Array) -> Array:
     """Return the beginning and the end of a row; a: (n, substeps, 3, ...)."""
     return jnp.stack([a[:, 0, 0], a[:, -1, -1]], axis=1)
@@ -344,14 +344,15 @@ def _unit(p: Array, row: Array) -> Array:
     return (jnp.arange(len(p)).reshape(-1, *(1,) * row.ndim) == row[None]).astype(p.dtype)
 
 
-def _along(function: Callable[[Array], Any], p: Array, units: Array, asked: Array) -> Any:
-    """Derivatives of a function of the parameters in every direction; zeros where they are not asked for."""
+def _along(function: Callable[[Array], Any], p: Array, units: Array) -> Any:
+    """Derivatives of a function of the parameters in every direction."""
+    return jax.vmap(lambda unit: jax.jvp(function, (p,), (unit,))[1])(units)
 
-    def worked_out() -> Any:
-        return jax.vmap(lambda unit: jax.jvp(function, (p,), (unit,))[1])(units)
 
-    shapes = jax.eval_shape(worked_out)
-    return jax.lax.cond(asked, worked_out, lambda: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes))
+def _if(asked: Array, worked_out: Callable[[], Array]) -> Array:
+    """Zeros where it is not asked for."""
+    shape = jax.eval_shape(worked_out)
+    return jax.lax.cond(asked, worked_out, lambda: jnp.zeros(shape.shape, shape.dtype))
 
 
 def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
