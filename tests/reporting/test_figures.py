@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from simpel_cli.reporting.figures import run
+from simpel_cli.reporting.figures.canvas import new_figure, ratio_scale
 from simpel_cli.runs.files import write_table
 from simpel_cli.runs.metrics import read_metrics, write_metrics
 
@@ -152,3 +153,14 @@ def test_distance_between_particles_is_drawn_where_the_kernel_tells_it(
     if panels == 3:
         drawn = figure.axes[1].lines[0].get_ydata()
         np.testing.assert_allclose(np.exp(-(np.asarray(drawn) ** 2) / 2), kernels, rtol=1e-9)
+
+
+@pytest.mark.parametrize("low", [0.4, 0.03, 1e-4, 1e-9, 1e-15])
+def test_a_logarithmic_axis_has_numbers_however_far_it_reaches(low: float) -> None:
+    axis = new_figure(1)[1][0]
+    axis.plot([0, 1], [low, 1.0])
+    ratio_scale(axis)
+    axis.figure.canvas.draw()
+    bottom, top = axis.get_ylim()
+    shown = [t.get_text() for t in axis.get_yticklabels() if bottom <= t.get_position()[1] <= top]
+    assert 2 <= len([text for text in shown if text]) <= 12

@@ -103,8 +103,16 @@ def ratio_scale(axis: Any) -> None:
     """Make the y axis logarithmic, with ticks that a person can read."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+    class Readable(LogLocator):
+        """1, 2 and 5 of every decade, where there are few; matplotlib would show none at all of many."""
+
+        def tick_values(self, low: float, high: float) -> Any:
+            few = low > 0 and high / low < 1e3
+            self.set_params(subs=(1.0, 2.0, 5.0) if few else (1.0,))
+            return super().tick_values(low, high)
+
     axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_locator(Readable())
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.yaxis.set_minor_formatter(NullFormatter())
 
