@@ -103,9 +103,10 @@ class Extended:
             scope: dict[str, Symbol] = {name: base.symbol(value) for name, value in (base.fixed | fixed).items()}
             for group, rows in ((base.states, x), (base.inputs, u), (params, p)):
                 scope |= {q.name: rows[i] for i, q in enumerate(group)}
-            for name, formula in values.items():
-                scope[name] = read_term(f"sim.inputs.{name}.value", formula, scope)
-            return scope
+            # each of the inputs as they are given, whichever of them is changed first
+            return scope | {
+                name: read_term(f"sim.inputs.{name}.value", formula, scope) for name, formula in values.items()
+            }
 
         def given(scope: dict[str, Symbol]) -> Symbol:
             return column(base.symbol, [scope[q.name] for q in base.inputs])

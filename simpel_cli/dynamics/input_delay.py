@@ -1,4 +1,4 @@
-"""Inputs as they arrive: through a play, held or linear between rows, delayed and lagged, over the integrator's substeps.
+"""Inputs as they arrive: through a play, at a limited rate, held or linear between rows, delayed and lagged, over substeps.
 
 A held input is a staircase; the mean over a substep that lies d in the past is a sum over samples, each weighted with the
 share of the substep that it fills: continuous in d, below one sample too. A linear input is a sum of hat functions; over a
@@ -23,6 +23,7 @@ def delayed_inputs(
     substeps: int,
     lead: int,
     half_play: Float[Array, " nu"] | None = None,
+    slowness: Float[Array, " nu"] | None = None,
     linear: Sequence[int] = (),
     share: Float[Array, " nu"] | None = None,
 ) -> Float[Array, "T substeps K nu"]:
@@ -36,6 +37,7 @@ def delayed_inputs(
         substeps: per row.
         lead: rows of the past; no delay is longer.
         half_play: half width of a play in front of the delay, in units of u, per input (see `play`); None: of no input.
+        slowness: s per unit of u that its actuator moves, per input, behind the play (see `slewed`); None: of no input.
         linear: inputs that go straight from a row to the next; the others are held.
         share: of the way from held (0) to linear (1), per input, of those in `linear`; None: all of it.
 
@@ -45,6 +47,10 @@ def delayed_inputs(
     """
     if half_play is not None:
         u = play(u, half_play)
+    part = jnp.ones(u.shape[1], u.dtype) if share is None else share
+    if slowness is not None:
+        lines = jnp.array([float(i in linear) for i in range(u.shape[1])], u.dtype)
+        u = slewed(u, slowness, dt, lines * part if linear else None)
     rows = u.shape[0] - bool(linear)
     before = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])  # before the record the first input was held
     near = before[jnp.arange(rows)[:, None] + jnp.arange(lead + 1 + bool(linear))[None]]
@@ -96,7 +102,6 @@ def delayed_inputs(
     if not linear:
         every = jax.vmap(one_held, in_axes=(2, 0, 0), out_axes=1)(near, delay, lag)
         return every.reshape(rows, substeps, 1, -1)[lead:]
-    part = jnp.ones(u.shape[1], u.dtype) if share is None else share
     columns = [
         one_linear(near[..., i], delay[i], lag[i], part[i])
         if i in linear
@@ -172,3 +177,36 @@ def play(u: Float[Array, "R nu"], half: Float[Array, " nu"]) -> Float[Array, "R 
         return after, after
 
     return jax.lax.scan(row, u[0], u)[1]
+
+
+def slewed(
+    u: Float[Array, "R nu"], slowness: Float[Array, " nu"], dt: float, linear: Float[Array, " nu"] | None = None
+) -> Float[Array, "R nu"]:
+    """Return what an actuator makes of its commands that follows them no faster than at a largest rate.
+
+        dv/dt = sign(u - v)/s while v is not u yet;   v = u at the first row
+
+    Of a command that is held, the mean over its row, which moves a velocity by as much as the way there does; of one that goes
+    straight from row to row, where it is at the row.
+
+    Args:
+        u: commands, row by row.
+        slowness: s, time for one unit of u, s per unit, per input; 0 = follows at once.
+        dt: distance of the rows, s.
+        linear: share of the way from held (0) to linear (1), per input; None: all are held.
+
+    Reference: Astrom and Rundqwist (1989), Integrator windup and how to avoid it, American Control Conference (actuators that
+    saturate in rate).
+    """
+
+    def row(carry: tuple[Array, Array], now: Array) -> tuple[tuple[Array, Array], Array]:
+        far, behind = now - carry[0], now - carry[1]
+        rows = jnp.abs(far) * slowness / dt  # that the way takes
+        late = jnp.abs(behind) * slowness / dt
+        left, late = 1 - 1 / jnp.maximum(rows, 1.0), 1 - 1 / jnp.maximum(late, 1.0)  # of the way, after a row
+        mean = now - far * jnp.where(rows <= 1, rows / 2, (1 + left) / 2)
+        at_row = now - behind * late
+        out = mean if linear is None else mean + linear * (at_row - mean)
+        return (now - far * left, at_row), out
+
+    return jax.lax.scan(row, (u[0], u[0]), u)[1]

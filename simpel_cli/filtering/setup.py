@@ -15,7 +15,7 @@ from simpel_cli.filtering.measurements import windows as windows_
 from simpel_cli.filtering.measurements.integration_steps import substeps_needed
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
 from simulators.effects import Expression, Scales, Term, unnamed
-from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, EffectParameter
+from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, RATE_LIMIT, EffectParameter
 from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
@@ -25,7 +25,9 @@ Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
 MOST_GROUPED = 2  # effects that differ between groups and act at once
 UNKNOWN_NOISE = 0.01  # of a channel's magnitude, where its noise begins if nothing tells it
-PLAY_ROWS = 24  # of the past before a window of a cut record: which side of its play an input is on, is mostly settled
+PLAY_ROWS = (
+    24  # of the past before a window of a cut record: where an input is in its play, or on its way, is mostly settled
+)
 
 
 class Setup(NamedTuple):
@@ -92,7 +94,7 @@ def setup(
     # of all of them, so that windows do not depend on what is kept
     longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.parameters), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
-    if any(t.kind == BACKLASH for t in every):
+    if any(t.kind in (BACKLASH, RATE_LIMIT) for t in every):
         lead = max(lead, PLAY_ROWS)
     spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
     timed = clocked([*recording.train, *recording.test], model.dt)

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import casadi
 
-from simulators.effects.structure import structure
+from simulators.effects.structure import drives, structure
 from simulators.effects.term import INPUT, NAMED, RATE, SENSOR, EffectParameter, Term
+from simulators.effects.units import per, unit_in
 from simulators.effects.vehicle import PARTS, Vehicle, vehicle
 from simulators.expression import RESERVED, parse
 from simulators.groups import Grouping, grouping
@@ -17,7 +18,9 @@ from simulators.model import Model, ModelError
 from simulators.quantity import Quantity
 
 PLANAR = "planar"  # a vehicle in the plane: a term per part of it
-ROLES = ("velocity", "angle_velocity", "first_order", "input", "measured", "measured_angle", PLANAR)
+SUPPLY = "supply"  # all inputs of one unit, which share a supply
+ROLES = ("velocity", "angle_velocity", "first_order", "input", SUPPLY, "measured", "measured_angle", PLANAR)
+ZERO = {"K": "0", "degC": "(-273.15)"}  # absolute, in a unit
 KIND_OF_ROLE = {"velocity": RATE, "angle_velocity": RATE, "first_order": RATE, "input": INPUT}
 
 
@@ -42,17 +45,18 @@ class Expression:
     Args:
         name: of the effect.
         meaning: one physical sentence.
-        acts_on: where: roles (velocity, angle_velocity, first_order, input, measured, measured_angle, planar) or names of
-            states, inputs and measured quantities.
+        acts_on: where: roles (velocity, angle_velocity, first_order, input, supply, measured, measured_angle, planar) or names
+            of states, inputs and measured quantities.
         term: what is added to the rate of a state, or what stands in place of an input or a measured quantity. Roles can
             be used for names: `v` the velocity acted on, `s` its position, `x` the first-order state, `other` another
-            state of the same unit, `around` an input of the same unit, `u` the input, `y` the measured quantity, `rate` the
-            model's own rate. For `planar` a mapping {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the
-            accelerations along, across and about the vehicle, and to the rate of a heading without inertia, each where the
-            model has it; names are `long`, `lat`, `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in
-            these axes.
-        operator: in place of `term`: delay, lag, backlash, sensor_delay or sensor_lag, on the signal that it acts on, with
-            one parameter.
+            state of the same unit, `around` an input of the same unit, `drive` an input that pushes the velocity from
+            standstill, `u` the input, `y` the measured quantity, `rate` the model's own rate, `zero` the absolute zero in the
+            unit of a temperature, `load` of a `supply` the mean magnitude of its inputs. For `planar` a mapping
+            {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the accelerations along, across and about the
+            vehicle, and to the rate of a heading without inertia, each where the model has it; names are `long`, `lat`,
+            `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in these axes.
+        operator: in place of `term`: delay, lag, backlash, rate_limit, sensor_delay or sensor_lag, on the signal that it acts
+            on, with one parameter.
         kind: rate, input or sensor, where `acts_on` names quantities; found from the model if left out.
         parameters: name -> {range: [low, high], unit, neutral: 0, starts: [...]}. Numbers, or expressions of the scales A
             (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
@@ -65,6 +69,8 @@ class Expression:
         dissipative: it never adds energy (tested).
         mutual: what it adds to the rate of `x` it takes from that of `other`: one term per pair of states, in which `x` is the
             one that the simulator names first.
+        passes: the share, a number or an expression of parameters, of what its term takes from `x` that `other` gains: one term
+            per pair of states and direction.
         widened: unique name of a parameter at a place -> its range there, where a search found that stated too narrow.
     """
 
@@ -80,6 +86,7 @@ class Expression:
     generalises: tuple[str, ...] = ()
     dissipative: bool = False
     mutual: bool = False
+    passes: str = ""
     per: str = ""
     widened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -102,10 +109,17 @@ class Expression:
             )
         if self.units and parts:
             raise ModelError(f"{where}.units: not with `acts_on: {PLANAR}`, whose parts are accelerations and a rate")
-        if isinstance(self.term, str) and self.term and {"other", "around"} <= _names(self.term):
+        if (
+            isinstance(self.term, str)
+            and self.term
+            and len(both := _names(self.term) & {"other", "around", "drive"}) > 1
+        ):
             raise ModelError(
-                f"{where}.term: {self.term!r} has both `other` and `around`; one effect is an exchange with one"
+                f"{where}.term: {self.term!r} has both `{'` and `'.join(sorted(both, reverse=True))}`; one effect is an "
+                "exchange with one"
             )
+        if self.passes and (self.mutual or not isinstance(self.term, str) or "other" in _names(self.term or "0")):
+            raise ModelError(f"{where}.passes: goes with a `term` of `x` alone that is not `mutual`")
         if self.mutual and not (isinstance(self.term, str) and self.term and "other" in _names(self.term)):
             raise ModelError(f"{where}.mutual: its term has no `other`, from whose rate it could be taken")
         if not isinstance(self.per, str) or not (self.per.isidentifier() or not self.per):
@@ -139,6 +153,10 @@ class Expression:
         if isinstance(self.term, Mapping):
             car = vehicle(model)
             return self._on_vehicle(self.term, car, model, scales) if car else []
+        if "drive" in _names(self.term or "0") and (car := vehicle(model)):  # along its heading, wherever that points
+            along, pushed = {"long": _renamed(self.term, {"v": "long"})}, drives(model)
+            motors = dict.fromkeys(motor for state in car.parts["long"] for motor in pushed[state])
+            return [t for motor in motors for t in self._on_vehicle(along, car, model, scales, motor)]
         roles = structure(model)
         units = {q.name: q.unit for q in (*model.states, *model.inputs, *model.outputs)}
         periodic = {q.name for q in model.states if q.periodic}
@@ -154,11 +172,14 @@ class Expression:
         allowed = (self.units,) if self.units and isinstance(self.units, str) else tuple(self.units)
         terms: list[Term] = []
         for place in self.places:
-            if place not in members and place not in units:
+            if place not in (*members, SUPPLY) and place not in units:
                 raise ModelError(
                     f"effect.{self.name}.acts_on: {place!r} is no role and no quantity of {model.name}; roles: "
                     f"{', '.join(ROLES)}; quantities: {', '.join(units)}"
                 )
+            if place == SUPPLY:
+                terms += self._on_supply(self.term, model, scales, units)
+                continue
             for name in members.get(place, (place,)):
                 if allowed and units[name] not in allowed:
                     continue
@@ -175,17 +196,23 @@ class Expression:
         units: dict[str, str],
         place: str,
     ) -> list[Term]:
-        states = [q.name for q in model.states]
+        states, zero = [q.name for q in model.states], ZERO.get(units[name])
         kind = self.operator or self.kind or KIND_OF_ROLE.get(place) or _kind(name, model, place)
         names = _names(term) if term else set()
-        if ("s" in names and position is None and "s" not in units) or (
-            "S" in str(self.parameters) and position is None
+        if (
+            ("s" in names and position is None and "s" not in units)
+            or ("S" in str(self.parameters) and position is None)
+            or ("zero" in names and zero is None)
         ):
             return []
         periodic = {q.name for q in model.states if q.periodic}
-        role = next((r for r in ("other", "around") if r in names), "")
+        role = "other" if self.passes else next((r for r in ("other", "around", "drive") if r in names), "")
         among = {"other": states, "around": [q.name for q in model.inputs]}.get(role, [])
         others = [n for n in among if n != name and units[n] == units[name]] if role else [""]
+        if role == "drive":
+            others = [*drives(model).get(name, ())]
+        if self.passes:
+            others = [n for n in others if n in structure(model).first_order]
         if self.mutual:
             if name not in states:
                 raise ModelError(
@@ -193,7 +220,7 @@ class Expression:
                 )
             dynamic = structure(model).dynamic  # nothing is taken from what a speed says of its position
             others = [n for n in others if n in dynamic]
-        own = {"v": name, "x": name, "u": name, "y": name} | ({"s": position} if position else {})
+        own = {"v": name, "x": name, "u": name, "y": name, "zero": zero} | ({"s": position} if position else {})
         size = scales.size
         values = {
             "A": scales.rate.get(name, 1.0),
@@ -207,6 +234,8 @@ class Expression:
             values["S"] = 3.141592653589793
         found = []
         for other in others:
+            if role == "drive":
+                values["U"], unit_of["U"] = size[other], units[other]
             parameters = self._parameters(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
             swap = own | {role: other} | {k.label: k.name for k in parameters}
             text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
@@ -217,11 +246,38 @@ class Expression:
                     text = _renamed(term, {"x": first, role: second} | {k.label: k.name for k in parameters})
                 both = ((first, text), (second, f"-({text})"))
                 found.append(self._term(f"{first}, {second}", kind, "", parameters, model, both))
+            elif self.passes:
+                share = _renamed(self.passes, {k.label: k.name for k in parameters})
+                both = ((name, text), (other, f"-({share})*({text})"))
+                found.append(self._term(f"{name}, {other}", kind, "", parameters, model, both))
             else:
                 found.append(self._term(name, kind, text, parameters, model))
         return found
 
-    def _on_vehicle(self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales) -> list[Term]:
+    def _on_supply(self, term: str, model: Model, scales: Scales, units: dict[str, str]) -> list[Term]:
+        """Return one term on all inputs of one unit, of every unit that several have; a vehicle's steering is no load."""
+        motors = None if vehicle(model) is None else {motor for of in drives(model).values() for motor in of}
+        sharing: dict[str, list[str]] = {}
+        for q in model.inputs:
+            if q.name in model.covariates or (self.units and q.unit not in self.units):
+                continue
+            if motors is None or q.name in motors:
+                sharing.setdefault(q.unit, []).append(q.name)
+        found = []
+        for unit, names in sharing.items():
+            if len(names) < 2:
+                continue
+            values, unit_of = {"U": max(scales.size[n] for n in names), "dt": scales.dt}, {"U": unit}
+            parameters = self._parameters("_".join([self.name, *names]), values, unit_of)
+            swap = {"load": "((" + " + ".join(f"abs({n})" for n in names) + f")/{len(names)})"}
+            swap |= {k.label: k.name for k in parameters}
+            several = tuple((n, _renamed(term, swap | {"u": n})) for n in names)
+            found.append(self._term(", ".join(names), INPUT, "", parameters, model, several))
+        return found
+
+    def _on_vehicle(
+        self, parts: Mapping[str, str], car: Vehicle, model: Model, scales: Scales, drive: str = ""
+    ) -> list[Term]:
         """Return one term on the rates of all states that the parts act on."""
         own = {part: text for part, text in parts.items() if part in car.parts}
         if not own:
@@ -236,10 +292,15 @@ class Expression:
         unit_of = {"A": "m/s^2", "V": "m/s", "W": "rad/s"}
         if "yaw" in car.parts:
             values["Q"], unit_of["Q"] = max(scales.rate[s] for s in turn), "rad/s^2"
+        if drive:
+            values["U"] = scales.size[drive]
+            unit_of["U"] = next(q.unit for q in model.inputs if q.name == drive)
         states = [q.name for q in model.states if any(q.name in car.parts[part] for part in own)]
         used = set().union(*(_names(text) for text in own.values()))
-        parameters = self._parameters("_".join([self.name, *states]), values, unit_of, used)
-        swap = car.names | {k.label: k.name for k in parameters}
+        parameters = self._parameters(
+            "_".join([self.name, *states, *([drive] if drive else [])]), values, unit_of, used
+        )
+        swap = car.names | {"drive": drive} | {k.label: k.name for k in parameters}
         sums: dict[str, list[str]] = {state: [] for state in states}
         for part, text in own.items():
             for state, factor in car.parts[part].items():
@@ -263,7 +324,7 @@ class Expression:
             starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
             parameters.append(
                 EffectParameter(
-                    f"{prefix}_{label}", label, _unit(node.get("unit", ""), unit_of), low, high, null, starts
+                    f"{prefix}_{label}", label, unit_in(node.get("unit", ""), unit_of), low, high, null, starts
                 )
             )
         return tuple(parameters)
@@ -327,38 +388,3 @@ def _value(value: Any, scales: Mapping[str, float], path: str) -> float:
         return float(parse(str(value), {name: casadi.SX(scale) for name, scale in scales.items()}))
     except ValueError as error:
         raise ModelError(f"{path}: {error}") from None
-
-
-def _unit(text: str, units: Mapping[str, str]) -> str:
-    """Work out a unit written in scales, `A/V`, in the units of the model: powers of base words are cancelled."""
-    powers: dict[str, int] = {}
-    for sign, factor in re.findall(r"([*/]?)\s*([^*/]+)", text):
-        base, _, exponent = factor.strip().partition("^")
-        power = (-1 if sign == "/" else 1) * int(exponent or 1)
-        _collect(units.get(base, base), power, powers)
-    return _written(powers)
-
-
-def per(unit: str, other: str) -> str:
-    """Return the unit of a quotient, e.g. `rad/s^2` for rad/s over s."""
-    powers: dict[str, int] = {}
-    _collect(unit, 1, powers)
-    _collect(other, -1, powers)
-    return _written(powers)
-
-
-def _collect(unit: str, power: int, powers: dict[str, int]) -> None:
-    upper, *lower = unit.replace("(", "").replace(")", "").split("/")
-    for part, sign in ((upper, 1), *((p, -1) for p in lower)):
-        for word in part.split():
-            base, _, exponent = word.partition("^")
-            if base not in ("", "1", "-"):
-                powers[base] = powers.get(base, 0) + sign * power * int(exponent or 1)
-
-
-def _written(powers: Mapping[str, int]) -> str:
-    def words(sign: int) -> str:
-        return " ".join(b + (f"^{abs(n)}" if abs(n) > 1 else "") for b, n in powers.items() if n * sign > 0)
-
-    upper, lower = words(1) or "1", words(-1)
-    return f"{upper}/{lower}" if lower and " " not in lower else f"{upper}/({lower})" if lower else upper

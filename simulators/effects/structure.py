@@ -9,6 +9,7 @@ from simulators.model import Model
 from simulators.quantity import READING
 
 VELOCITIES = ("m/s", "rad/s", "deg/s", "1/min", "rpm")  # units that nothing else than a velocity has
+SAME = 1e-9  # of a rate: below, rounding
 _FIRST_ORDER = ("level", "temperature", "other")
 
 
@@ -69,6 +70,28 @@ def structure(model: Model) -> Structure:
     said = {q.name for q in model.states if q.role}
     inferred = {name: why for name, why in inferred.items() if name not in said}
     return Structure(tuple(names[i] for i in kinematic), velocity, tuple(first), inferred)
+
+
+def drives(model: Model) -> dict[str, tuple[str, ...]]:
+    """Return velocity -> the inputs that push it from standstill while the others are 0: a motor does, a steering angle not."""
+    function, random = model.function(), np.random.default_rng(0)
+    x = np.array([random.uniform(0.5, 1.5) for _ in model.states])
+    velocity = structure(model).velocity
+    x[[q.name in velocity for q in model.states]] = 0.0
+    p = [random.uniform(q.low, q.high) for q in model.params]
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(velocity, ())
+    still = np.asarray(function(x, np.zeros(len(model.inputs)), p)[0]).ravel()
+    for j, q in enumerate(model.inputs):
+        if q.name in model.covariates:
+            continue
+        pushed = np.asarray(
+            function(x, np.where(np.arange(len(model.inputs)) == j, q.high or q.low, 0.0), p)[0]
+        ).ravel()
+        moved = np.abs(pushed - still) > SAME * np.maximum(np.abs(pushed), np.abs(still))
+        found |= {
+            s.name: (*found[s.name], q.name) for s, m in zip(model.states, moved, strict=True) if m and s.name in found
+        }
+    return found
 
 
 def depends(model: Model) -> tuple[np.ndarray, ...]:

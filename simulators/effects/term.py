@@ -7,8 +7,9 @@ from simulators.groups import Grouping
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
+RATE_LIMIT = "rate_limit"  # the signal moves by one unit in so many seconds at the fastest
 BETWEEN_ROWS = "between_rows"  # a share of the way from an input that is held to one that is linear
-ON_INPUT = (DELAY, LAG, BACKLASH, BETWEEN_ROWS)
+ON_INPUT = (DELAY, LAG, BACKLASH, RATE_LIMIT, BETWEEN_ROWS)
 ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
 OPERATORS = (*ON_INPUT, *ON_SENSOR)
 NAMED = tuple(kind for kind in OPERATORS if kind != BETWEEN_ROWS)  # that an effect may state: the other is no effect
@@ -36,9 +37,9 @@ class Term(NamedTuple):
     Args:
         effect: its name.
         acts_on: the state whose rate it changes, the input or the measured quantity that it alters; of a term on several
-            rates their states, separated by commas.
+            rates or inputs their names, separated by commas.
         kind: RATE, INPUT, SENSOR or one of OPERATORS.
-        expression: in the names of the model and of the parameters; empty for operators and for terms on several rates. RATE
+        expression: in the names of the model and of the parameters; empty for operators and for terms on several places. RATE
             adds it to the rate; INPUT and SENSOR put it in place of the quantity.
         parameters: its parameters.
         meaning: one physical sentence.
@@ -49,7 +50,8 @@ class Term(NamedTuple):
         constants: numbers of the expression that were read off the measurements, by name; programs take them as
             arguments, so that other measurements share what was compiled.
         groupings: how its parameters differ from group to group.
-        several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate.
+        several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate; of one on
+            several inputs: (input, expression).
     """
 
     effect: str
@@ -74,7 +76,16 @@ class Term(NamedTuple):
     @property
     def rates(self) -> dict[str, str]:
         """State -> what is added to its rate."""
-        return dict(self.several) or ({self.acts_on: self.expression} if self.kind == RATE else {})
+        return self._places if self.kind == RATE else {}
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Input -> what stands in its place."""
+        return self._places if self.kind == INPUT else {}
+
+    @property
+    def _places(self) -> dict[str, str]:
+        return dict(self.several) or {self.acts_on: self.expression}
 
     @property
     def formula(self) -> str:

@@ -11,9 +11,10 @@ from itertools import combinations
 
 from numpy.polynomial import chebyshev, polynomial
 
-from simulators.effects.expression import Scales, per
+from simulators.effects.expression import Scales
 from simulators.effects.structure import structure
 from simulators.effects.term import RATE, EffectParameter, Term
+from simulators.effects.units import per
 from simulators.groups import slots_of
 from simulators.model import Model
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simpel_cli.dynamics.input_delay import delayed_inputs, play
+from simpel_cli.dynamics.input_delay import delayed_inputs, play, slewed
 
 DT, SUBSTEPS, LEAD = 0.1, 4, 8
 U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
@@ -117,3 +117,54 @@ def test_a_delay_of_whole_rows_is_that_however_it_is_compiled(rows: int) -> None
 
     found = jax.jit(jax.vmap(arrived, in_axes=(0, None)))(inputs, late)
     np.testing.assert_allclose(found, np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=5e-6)
+
+
+def driven(u: np.ndarray, slowness: float, *, linear: bool, fine: int = 4000) -> tuple[np.ndarray, np.ndarray]:
+    """An actuator of limited rate in small steps: its mean over every row, and where it is at the row."""
+    v, means, at_rows = u[0], [], []
+    for k in range(len(u)):
+        total = 0.0
+        at_rows.append(v)
+        following = u[min(k + 1, len(u) - 1)]
+        for i in range(fine):
+            wanted = u[k] + (following - u[k]) * (i + 0.5) / fine if linear else u[k]
+            before, v = v, v + np.clip(wanted - v, -DT / fine / slowness, DT / fine / slowness)
+            total += (before + v) / 2
+        means.append(total / fine)
+    return np.array(means), np.array(at_rows)
+
+
+@pytest.mark.parametrize("rows", [0.3, 1.0, 2.7])
+def test_an_actuator_of_limited_rate_is_one_in_small_steps(rows: float) -> None:
+    slowness = rows * DT / np.abs(np.diff(U[:, 0])).max()
+    held = slewed(jnp.asarray(U), jnp.array([slowness]), DT)[:, 0]
+    np.testing.assert_allclose(held, driven(U[:, 0], slowness, linear=False)[0], atol=1e-3)
+    smooth = np.sin(0.25 * np.arange(40.0))  # turns, and is caught up with
+    slowness = rows * DT / np.abs(np.diff(smooth)).max()
+    line = slewed(jnp.asarray(smooth)[:, None], jnp.array([slowness]), DT, jnp.ones(1))[:, 0]
+    np.testing.assert_allclose(line, driven(smooth, slowness, linear=True)[1], atol=0.02)
+
+
+def test_a_rate_without_limit_changes_nothing_and_its_slope_is_that_of_one_that_begins() -> None:
+    np.testing.assert_array_equal(slewed(jnp.asarray(U), jnp.zeros(1), DT), U)
+    total = lambda s: jnp.sum(slewed(jnp.asarray(U), s[None], DT)[:, 0] * jnp.arange(1.0, len(U) + 1))  # noqa: E731
+    for at in (0.0, 0.04):
+        slope = (total(jnp.asarray(at + 1e-7)) - total(jnp.asarray(at))) / 1e-7
+        assert abs(slope) > 1
+        np.testing.assert_allclose(jax.grad(total)(jnp.asarray(at)), slope, rtol=1e-4)
+
+
+@pytest.mark.parametrize("linear", [(), (0,)])
+def test_a_limited_rate_comes_before_delay_and_lag(linear: tuple[int, ...]) -> None:
+    given = U if not linear else np.concatenate([U, U[-1:]])
+    slow, times = jnp.array([0.07]), (jnp.array([0.137]), jnp.array([0.2]))
+    both = delayed_inputs(jnp.asarray(given), *times, dt=DT, substeps=SUBSTEPS, lead=LEAD, slowness=slow, linear=linear)
+    first = slewed(jnp.asarray(given), slow, DT, jnp.ones(1) if linear else None)
+    after = delayed_inputs(first, *times, dt=DT, substeps=SUBSTEPS, lead=LEAD, linear=linear)
+    np.testing.assert_allclose(both, after, rtol=1e-12)
+    assert (
+        np.abs(
+            both - delayed_inputs(jnp.asarray(given), *times, dt=DT, substeps=SUBSTEPS, lead=LEAD, linear=linear)
+        ).max()
+        > 0.1
+    )

@@ -16,6 +16,7 @@ from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR
 from simulators.model import Declared, Model, ModelError
 
 LISTS = ("all", "vehicle")
+LIMITS = ("input_saturation", "pacejka_tyre", "sensor_saturation", "traction_limit")
 NAMES = sorted(p.stem for p in (conf_dir() / "effect").glob("*.yaml") if p.stem not in LISTS)
 
 
@@ -52,6 +53,16 @@ def room() -> Model:
     ).model()
 
 
+def lifter() -> Model:
+    """Two motors on one supply, and a flap."""
+    return Declared(
+        "lifter", dt=0.05,
+        states={"v": {"unit": "m/s", "range": [-3, 3]}, "w": {"unit": "rad/s", "range": [-3, 3]}},
+        inputs={n: {"unit": "V", "range": [0, 8]} for n in ("left", "right")} | {"flap": {"unit": "rad", "range": [-1, 1]}},
+        dynamics={"v": "left + right - 9.81", "w": "2*(left - right) + flap"},
+    ).model()  # fmt: skip
+
+
 def car(frame: str) -> Model:
     """A car that turns where its wheels point: in the world frame, in its own frame, or with one speed."""
     if frame == "world":
@@ -72,17 +83,18 @@ def car(frame: str) -> Model:
     ).model()
 
 
-PENDULUM, TANKS, ROOM = pendulum(), tanks(), room()
+PENDULUM, TANKS, ROOM, LIFTER = pendulum(), tanks(), room(), lifter()
 WORLD, BODY, SINGLE = CARS = tuple(car(frame) for frame in ("world", "body", "single"))
-VEHICLE = ("rolling_resistance", "traction_limit", "tyre_slip")
+VEHICLE = ("pacejka_tyre", "rolling_resistance", "traction_limit", "tyre_slip")
+OF_ROOMS = ("input_exchange", "radiation")  # of temperatures
 SCALES = {
     "pendulum": Scales({"phi": 3.0, "omega": 4.0, "u": 2.0}, {"phi": 2.0, "omega": 6.0}, 0.05),
     "tanks": Scales({"h": 0.8, "k": 0.7, "u": 1.0}, {"h": 0.2, "k": 0.1}, 1.0),
 } | {
     m.name: Scales({q.name: 2.0 for q in (*m.states, *m.inputs)}, {q.name: 3.0 for q in m.states}, m.dt)
-    for m in (ROOM, *CARS)
+    for m in (ROOM, LIFTER, *CARS)
 }
-MEASURED = {m.name: tuple(q.name for q in m.states) for m in (PENDULUM, TANKS, ROOM, *CARS)}
+MEASURED = {m.name: tuple(q.name for q in m.states) for m in (PENDULUM, TANKS, ROOM, LIFTER, *CARS)}
 
 
 def terms_of(name: str) -> list[tuple[Model, Term]]:
@@ -93,7 +105,8 @@ def terms_of(name: str) -> list[tuple[Model, Term]]:
             PENDULUM,
             TANKS,
             *(CARS if name in VEHICLE else ()),
-            *((ROOM,) if name == "input_exchange" else ()),
+            *((ROOM,) if name in OF_ROOMS else ()),
+            *((LIFTER,) if name == "voltage_sag" else ()),
         )
         for term in effect.attach(model, SCALES[model.name], MEASURED[model.name])
     ]
@@ -119,7 +132,7 @@ def points(model: Model, seed: int = 0) -> list[tuple[list[float], list[float]]]
 
 
 def test_the_catalogue_is_that_of_the_plan() -> None:
-    assert len(NAMES) >= 34
+    assert len(NAMES) >= 41
     listed = yaml.safe_load((conf_dir() / "effect" / "all.yaml").read_text())["defaults"]
     assert sorted(listed) == NAMES
 
@@ -162,7 +175,7 @@ class TestEffect:
                 assert all(parameter.low < s < parameter.high for s in parameter.starts)
                 # a limit is neutral where nothing reaches it, beyond the range
                 assert parameter.low <= parameter.neutral <= parameter.high or (
-                    term.effect in ("input_saturation", "traction_limit") and parameter.neutral > parameter.high
+                    term.effect in LIMITS and not parameter.low < parameter.neutral < parameter.high
                 )
                 assert re.fullmatch(r"[\w^/() ]+", parameter.unit), parameter.unit
 

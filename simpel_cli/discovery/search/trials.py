@@ -249,7 +249,8 @@ class Search:
         own = self.terms[best.terms[-1]]
         for other in named[1:]:
             term = self.terms[other.terms[-1]]
-            simpler = term.effect in own.generalises and own.acts_on in (term.acts_on, *term.acts_on.split(", "))
+            place, *_ = own.acts_on.split(", ")  # what a general one takes from, where another state gains it
+            simpler = term.effect in own.generalises and place in (term.acts_on, *term.acts_on.split(", "))
             value = other.optimum.log_evidence
             if simpler and value > least and best.optimum.log_evidence - value < ACCEPT:
                 best, own = other, term
@@ -316,9 +317,10 @@ class Search:
     def as_good(self, trial: Trial, chosen: Trial, own: int) -> bool:
         """Whether a trial does as well as the chosen model whose term `own` its last one replaces."""
         term, here, there = self.terms[trial.terms[-1]], trial.optimum, chosen.optimum
+        place, *_ = term.acts_on.split(", ")
         if term.depends_on:
             return here.log_evidence >= there.log_evidence + ACCEPT
-        if self.terms[own].effect in term.generalises and self.terms[own].acts_on == term.acts_on:
+        if self.terms[own].effect in term.generalises and self.terms[own].acts_on in (term.acts_on, place):
             return False
         fits = len(term.parameters) <= len(self.terms[own].parameters) and here.loss <= there.loss + SAME
         return fits or here.log_evidence >= there.log_evidence - TIE

@@ -8,7 +8,7 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict.groups import differing, spread_of
 from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simulators.effects import Term
-from simulators.effects.term import BACKLASH, DELAY, INPUT, LAG, ON_SENSOR, SENSOR
+from simulators.effects.term import BACKLASH, DELAY, LAG, ON_SENSOR, RATE_LIMIT, SENSOR
 from simulators.model import Declared, Model
 from simulators.quantity import READING
 
@@ -17,7 +17,8 @@ STIFF = 8  # Runge-Kutta steps per row: groups at the far end of a population mo
 NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
 _SENSOR = "a simulator describes the system, not its sensors: correct the measurements instead"
 CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
-    BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain"
+    BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain",
+    RATE_LIMIT: "where the actuator is depends on all past inputs, which a single transition does not contain",
 }
 
 
@@ -81,9 +82,9 @@ def _extended(
     for term in terms:
         if term.kind in (DELAY, LAG):
             inputs.setdefault(term.acts_on, {})[term.kind] = names[term.parameters[0].name]
-        elif term.kind == INPUT:
-            before = inputs.setdefault(term.acts_on, {}).get("value", term.acts_on)
-            inputs[term.acts_on]["value"] = _renamed(term.expression, names | {term.acts_on: f"({before})"})
+        for signal, text in term.inputs.items():
+            before = inputs.setdefault(signal, {}).get("value", signal)
+            inputs[signal]["value"] = _renamed(text, names | {signal: f"({before})"})
         for state, text in term.rates.items():
             own = {} if term.several else {"rate": f"rate_{state}"}
             added = f"({_renamed(text, names | own)})"
@@ -106,9 +107,8 @@ def _declared(
         if term.kind in (DELAY, LAG):
             own = node["inputs"][term.acts_on]
             node["inputs"][term.acts_on] = own | {term.kind: names[term.parameters[0].name]}
-        elif term.kind == INPUT:
-            own = {term.acts_on: given.get(term.acts_on, term.acts_on)}
-            given[term.acts_on] = f"({_renamed(term.expression, names | own)})"
+        for signal, text in term.inputs.items():
+            given[signal] = f"({_renamed(text, names | {signal: given.get(signal, signal)})})"
     # the rates of the simulator with the changed inputs: every term adds to these, and takes its rates from these
     base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
     rates = {f"rate_{state}": f"({text})" for state, text in base.items()}

@@ -30,8 +30,8 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.measurements.windows import Windows
 from simulators.effects import Term
-from simulators.effects.expression import per
 from simulators.effects.term import OPERATORS, SENSOR
+from simulators.effects.units import per
 from simulators.expression import symbols_used
 from simulators.groups import slots_of
 from simulators.model import Model
@@ -145,7 +145,7 @@ def _curves(search: Search, selection: Selection, span: dict[str, np.ndarray]) -
         p = neutral.copy()
         for i in search.rows[t]:
             p[i] = coordinates.value(i, float(chosen.optimum.z[i]))
-        used = set().union(*(symbols_used(e) for e in term.rates.values() or (term.expression,)))
+        used = set().union(*(symbols_used(e) for e in (term.rates or term.inputs).values()))
         for argument in [name for name in span if name in used]:
             values = np.linspace(np.nanmin(span[argument]), np.nanmax(span[argument]), GRID)
             at = middle | {argument: values}

@@ -10,7 +10,7 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
 from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
 from simpel_cli.filtering.errors_ahead import Assessment
 from simpel_cli.filtering.likelihood.whiteness import memory
-from simulators.effects.expression import per
+from simulators.effects.units import per
 
 ALIKE = 0.3  # of an input's variance, at the period of a disturbance
 

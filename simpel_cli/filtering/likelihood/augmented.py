@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from simulators.effects import Structure, Term, structure
-from simulators.effects.term import DELAY, INPUT, LAG, ON_INPUT, OPERATORS, SENSOR
+from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, SENSOR
 from simulators.expression import parse
 from simulators.model import Model, Quantity
 
@@ -84,8 +84,8 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
     given = [u[j] for j in range(len(model.inputs))]
     for j, q in enumerate(model.inputs):
         for term in terms:
-            if term.kind == INPUT and term.acts_on == q.name:
-                given[j] = parse(term.expression, names | {q.name: given[j]}, model.symbol)
+            if q.name in term.inputs:
+                given[j] = parse(term.inputs[q.name], names | {q.name: given[j]}, model.symbol)
     effective = casadi.vertcat(*given) if given else model.symbol(0, 1)
     names |= {q.name: given[j] for j, q in enumerate(model.inputs)}
     base = model.rhs(x, effective, own)

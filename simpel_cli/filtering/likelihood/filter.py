@@ -37,7 +37,7 @@ from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, p
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
 from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
-from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
+from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT, SENSOR_DELAY, SENSOR_LAG
 
 _KEPT: OrderedDict[tuple, Filter] = OrderedDict()
 MOST_KEPT = (
@@ -76,6 +76,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
+    slow = augmented.operators[RATE_LIMIT]
     # where it is asked whether an input is linear, a share of the way from held says so
     linear = tuple(sorted({*model.linear, *(signal for signal, _ in shares)}))
     said = tuple(float(i in model.linear) for i in range(nu))
@@ -98,6 +99,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def late_inputs(p: Array, u: Array) -> Array:
         times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
         more = {"half_play": per_signal(p, plays, nu)} if plays else {}
+        if slow:
+            more["slowness"] = per_signal(p, slow, nu)
         if linear:
             more["share"] = per_signal(p, shares, nu, said)
             u = jnp.concatenate([u, u[-1:]])  # nothing is predicted from the last row of a window
@@ -258,7 +261,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
         return now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
 
-    of_inputs = sorted({row for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS) for _, row in augmented.operators[kind]})
+    of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
     timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)
     return Filter(
         "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs
