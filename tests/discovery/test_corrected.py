@@ -20,8 +20,10 @@ from simulators.model import Model
 
 OF_A_SHAFT = ("coulomb_friction", "input_offset", "input_saturation")
 CASES = {
-    "rc_car": ("rolling_resistance", "traction_limit", "tyre_slip", "input_saturation"),
-    "racecar": ("rolling_resistance", "traction_limit", "input_saturation", "input_delay"),
+    "rc_car": ("rolling_resistance", "traction_limit", "tyre_slip", "input_saturation", "motor_back_emf"),
+    "racecar": ("rolling_resistance", "traction_limit", "input_saturation", "input_delay", "pacejka_tyre"),
+    "oven": ("radiation", "overflow_into", "voltage_sag", "input_offset"),
+    "oven in Python": ("radiation", "overflow_into", "voltage_sag", "input_offset"),
     "pendulum": ("coulomb_friction", "added_inertia", "input_offset", "input_dead_zone"),
 }
 
@@ -76,11 +78,21 @@ SHAFT = {
 }
 
 
+OVEN = {
+    "name": "oven",
+    "dt": 1.0,
+    "states": {n: {"unit": "degC", "range": [20, 400], "role": "temperature"} for n in ("T", "lid")},
+    "inputs": {n: {"unit": "%", "range": [0, 100]} for n in ("top", "bottom")},
+    "parameters": {"a": {"unit": "degC/s/%", "range": [0.01, 0.02]}},
+    "dynamics": {"T": "a*(top + 2*bottom) - 0.01*(T - lid)", "lid": "a*top"},
+}
+
+
 @pytest.mark.parametrize("sim", [*CASES, "shaft", "in Python"])
 def test_the_yaml_has_the_rates_that_were_fitted(sim: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    node: Any = {"shaft": SHAFT, "in Python": {"_target_": module.EXTENDED, "name": "more", "base": SHAFT}}.get(
-        sim, sim
-    )
+    in_python = {n: {"_target_": module.EXTENDED, "name": "more", "base": base} for n, base in
+                 (("in Python", SHAFT), ("oven in Python", OVEN))}  # fmt: skip
+    node: Any = ({"shaft": SHAFT, "oven": OVEN} | in_python).get(sim, sim)
     model, terms, corrected, left_out = written(node, CASES.get(sim, OF_A_SHAFT), monkeypatch)
     new = build(corrected, "sim").model()
     assert (new.states, new.saturation) == (model.states, model.saturation)
@@ -119,12 +131,18 @@ def test_intermediates_tables_roles_and_sensors_are_carried_on(monkeypatch: pyte
     assert SHAFT["tables"]["torque"]["inputs"] == ["u", "n"]  # what was declared is not changed
 
 
+LATE = ("input_backlash", "sensor_lag", "input_lag", "actuator_rate_limit", "sensor_saturation")
+LEFT_OUT = (
+    ("sensor_saturation", "phi"), ("actuator_rate_limit", "u"), ("sensor_lag", "phi"), ("input_backlash", "u"),
+)  # fmt: skip
+
+
 def test_what_a_transition_cannot_hold_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _, corrected, left_out = written("pendulum", ("input_backlash", "sensor_lag", "input_lag"), monkeypatch)
+    model, _, corrected, left_out = written("pendulum", LATE, monkeypatch)
     new = build(corrected, "sim").model()
     assert new.lag == {"u": "tau"}
     assert model.lag == {}
-    assert [text.split(" (")[0] for text in left_out] == ["sensor_lag on phi", "input_backlash on u"]
+    assert [text.split(" (")[0] for text in left_out] == [f"{e} on {p}" for e, p in LEFT_OUT]
     assert all(len(text.split(" (")[1]) > 30 for text in left_out)
 
 

@@ -204,3 +204,20 @@ def test_the_catalogue_composes_with_all_names() -> None:
         assert (
             build(yaml.safe_load((conf_dir() / "effect" / f"{name}.yaml").read_text()), f"effect.{name}").name == name
         )
+
+
+def test_an_outflow_through_a_long_pipe_is_linear_where_the_simulator_has_a_root() -> None:
+    """Hagen and Poiseuille in place of Torricelli: with c = k sqrt(x_r) of the simulator nothing of the root is left."""
+    tank = Declared(
+        "tank", dt=1.0, states={"h": {"unit": "m", "range": [0, 1]}}, inputs={"u": {"unit": "m/s", "range": [0, 1]}},
+        dynamics={"h": "u - 0.12*sqrt(h)"},
+    ).model()  # fmt: skip
+    (term,) = attached("linear_outflow", tank)
+    k = 0.12 / np.sqrt(0.5)
+    for level in (0.1, 0.5, 0.9):
+        np.testing.assert_allclose(values(tank, term, [level], [0.2], [k, 0.5])[0][0], 0.2 - k * level, rtol=1e-12)
+    (leak,) = attached("leak", tank)
+    np.testing.assert_allclose(
+        push(tank, term, [0.4], [0.2], [k, 0.0]), push(tank, leak, [0.4], [0.2], [k]), rtol=1e-12
+    )
+    assert not attached("linear_outflow", ROOM)

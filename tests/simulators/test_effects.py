@@ -132,7 +132,7 @@ def points(model: Model, seed: int = 0) -> list[tuple[list[float], list[float]]]
 
 
 def test_the_catalogue_is_that_of_the_plan() -> None:
-    assert len(NAMES) >= 41
+    assert len(NAMES) >= 44
     listed = yaml.safe_load((conf_dir() / "effect" / "all.yaml").read_text())["defaults"]
     assert sorted(listed) == NAMES
 
