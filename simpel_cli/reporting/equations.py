@@ -21,14 +21,14 @@ def equations(sim: Mapping[str, Any]) -> list[str]:
         inputs = {k: v for k, v in (sim.get("inputs") or {}).items() if isinstance(v, Mapping) and "value" in v}
         lines += [f"{name} acts as {node['value']}" for name, node in inputs.items()]
         lines += [f"d{name}/dt = rate_{name} + {term}" for name, term in (sim.get("dynamics") or {}).items()]
-        return lines + _sensors(sim)
+        return lines + of_sensors(sim)
     parameters = sim.get("parameters") or {}
     lines = [f"{name} = {node}" for name, node in parameters.items() if isinstance(node, str)]
     lines += [f"{name} = {_expression(node)}{_unit(node)}" for name, node in (sim.get("intermediates") or {}).items()]
     for name, node in (sim.get("tables") or {}).items():
         lines.append(f"{name} = table of {', '.join(map(str, node['inputs']))}{_unit(node)}")
     lines += [f"d{name}/dt = {formula}" for name, formula in (sim.get("dynamics") or {}).items()]
-    return lines + [_reading(name, node) for name, node in (sim.get("outputs") or {}).items()] + _sensors(sim)
+    return lines + [_reading(name, node) for name, node in (sim.get("outputs") or {}).items()] + of_sensors(sim)
 
 
 def tables(sim: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -86,7 +86,7 @@ def _reading(name: str, node: Any) -> str:
     return f"{name} = {text}{_unit(node)}" + (f"   ({'; '.join(extra)})" if extra else "")
 
 
-def _sensors(sim: Mapping[str, Any]) -> list[str]:
+def of_sensors(sim: Mapping[str, Any]) -> list[str]:
     """Return what the columns of states and outputs show: `the sensor of NAME shows VALUE`, its lag and its delay."""
     lines = []
     for name, node in (sim.get("sensors") or {}).items():
