@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from simpel_cli.dynamics.late_readings import behind
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simulators.model import Declared
@@ -97,6 +98,16 @@ def test_of_the_third_order_along_a_free_motion(kind: str) -> None:
         y = np.asarray(jax.jit(jax.vmap(step, in_axes=(0, None)))(jnp.asarray(x), jnp.zeros(0)))
         errors.append(np.abs(y[:, 0] - np.diff(seen[40:])).max())
     assert 6 < errors[0] / errors[1] < 12
+
+
+def test_the_rows_of_an_episode() -> None:
+    u = np.random.default_rng(0).uniform(-1, 1, 40)
+    for sensor, column in (("v", 1), ("pull", 2)):
+        states, seen = readings(sensor, 0.05, 0.0, u)
+        prompt = np.concatenate([states, 2 * states[:, :1] - states[:, 1:]], axis=1)[:, column]
+        shown = behind(swing({sensor: {"lag": 0.05}}).model(), states, u[:, None], np.zeros(0))
+        assert np.abs(prompt + shown[:, column] - seen)[6:].max() < 0.1 * np.abs(prompt - seen)[6:].max()
+        assert not shown[:, [i for i in range(3) if i != column]].any()
 
 
 def test_past_inputs_are_asked_for() -> None:
