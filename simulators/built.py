@@ -59,6 +59,9 @@ class Built(Declared, ABC):
         times = [node.get(key) for node in self.inputs.values() for key in ("delay", "lag") if isinstance(node, dict)]
         numbers = [node.get(key) for node in self.outputs.values() for key in SENSOR if isinstance(node, dict)]
         times += [number for number in numbers if isinstance(number, str)]
+        seen = [node for node in self.sensors.values() if isinstance(node, dict)]
+        formulas += [str(node["value"]) for node in seen if "value" in node]
+        times += [node.get(key) for node in seen for key in ("delay", "lag")]
         return {name for formula in formulas for name in symbols_in(formula)} | {t for t in times if isinstance(t, str)}
 
 

@@ -23,6 +23,7 @@ from simulators.quantity import (
     read_uncertain,
     refuse_unknown,
 )
+from simulators.readings import with_sensors
 from simulators.sections import NUMBER, SECTIONS, either, keys, named
 
 INPUT = ("value", *GIVEN)
@@ -49,6 +50,7 @@ class Extended:
         inputs: input: {value: expression in its place, delay, lag, between_rows}, each if there is one; see `Declared`.
         dynamics: state: expression that is added to its rate, in states, inputs, parameters, and rate_STATE for the rate that
             the simulator itself has.
+        sensors: state or output: {value, lag, delay}; what its column shows, see `Declared`.
 
     Raises:
         ModelError: names the key, what it holds, what is allowed and the cure.
@@ -60,11 +62,13 @@ class Extended:
     parameters: dict[str, Any] = field(default_factory=dict)
     inputs: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
+    sensors: dict[str, Any] = field(default_factory=dict)
 
     sections: ClassVar[dict[str, Any]] = {  # JSON schemas of fields
         "parameters": named(either(NUMBER, keys(UNCERTAIN, ("range",)))),
         "inputs": named(keys(INPUT)),
         "dynamics": SECTIONS["dynamics"],
+        "sensors": SECTIONS["sensors"],
     }
 
     def model(self) -> Model:
@@ -99,9 +103,13 @@ class Extended:
         params = (*base.params, *own)
         values = {name: node["value"] for name, node in self.inputs.items() if "value" in node}
 
-        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+        def named(p: Symbol) -> dict[str, Symbol]:
             scope: dict[str, Symbol] = {name: base.symbol(value) for name, value in (base.fixed | fixed).items()}
-            for group, rows in ((base.states, x), (base.inputs, u), (params, p)):
+            return scope | {q.name: p[i] for i, q in enumerate(params)}
+
+        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            scope = named(p)
+            for group, rows in ((base.states, x), (base.inputs, u)):
                 scope |= {q.name: rows[i] for i, q in enumerate(group)}
             # each of the inputs as they are given, whichever of them is changed first
             return scope | {
@@ -133,6 +141,7 @@ class Extended:
             between_rows=base.between_rows | read_between_rows(self.inputs),
             **late,
         )
+        model = with_sensors(model, self.sensors, named)
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
 

@@ -139,11 +139,16 @@ def refuse_late(model: Model, parameter: str, key: str) -> None:
         ModelError: `key` says that it differs from group to group.
 
     """
-    for what, times in (("delay", model.delay), ("lag", model.lag)):
+    late = {
+        "inputs": {"delay": model.delay, "lag": model.lag},
+        "sensors": {"delay": model.sensor_delay, "lag": model.sensor_lag},
+    }
+    for section, what, times in ((section, *item) for section, kinds in late.items() for item in kinds.items()):
         for name, value in times.items():
             if value == parameter:
                 raise ModelError(
-                    f"{key}: sim.inputs.{name}.{what} depends on it, and a {what} is the same for all groups; leave `per` out"
+                    f"{key}: sim.{section}.{name}.{what} depends on it, and a {what} is the same for all groups; leave "
+                    "`per` out"
                 )
 
 

@@ -8,10 +8,11 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import casadi
 
+from simulators.coordinates import UNLIMITED, Coordinates, Flow
 from simulators.definitions import (
     evaluated,
     in_order,
@@ -38,56 +39,14 @@ from simulators.quantity import (
     read_variable,
     refuse_unknown,
 )
+from simulators.readings import with_sensors
 from simulators.sections import SECTIONS
 from simulators.sensors import read_sensors, with_lagging_readings
 from simulators.tables import read_tables
 
 __all__ = ["Coordinates", "Declared", "Flow", "Model", "ModelError", "Quantity"]
 
-UNLIMITED = (-math.inf, math.inf)
 TIE = 1e-9  # rows; a delay of a whole number of rows must not need one more
-
-
-class Coordinates(NamedTuple):
-    """Coordinates z in which a transition is integrated, where these are not the states themselves.
-
-    Args:
-        size: rows of z.
-        enter: (x, p) -> z.
-        rhs: (z, u, p) -> dz/dt.
-        leave: (z, p) -> x.
-        limits: lowest and highest value of every row of z, to which it is clipped after each Runge-Kutta step.
-
-    """
-
-    size: int
-    enter: Callable[[Symbol, Symbol], Symbol]
-    rhs: Callable[[Symbol, Symbol, Symbol], Symbol]
-    leave: Callable[[Symbol, Symbol], Symbol]
-    limits: tuple[float, float] = UNLIMITED
-
-
-class Flow(NamedTuple):
-    """What an integrator of a model needs.
-
-    Args:
-        enter: CasADi function (x, p) -> z; None: z = x.
-        rhs: CasADi function (z, u, p) -> dz/dt.
-        leave: CasADi function (z, p) -> x; None: x = z.
-        low, high: per row of z, to which it is clipped after each Runge-Kutta step; infinite where nothing limits it.
-
-    """
-
-    enter: casadi.Function | None
-    rhs: casadi.Function
-    leave: casadi.Function | None
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-    @property
-    def limited(self) -> bool:
-        """Whether anything is clipped."""
-        return any(math.isfinite(end) for end in (*self.low, *self.high))
 
 
 @dataclass(frozen=True)
@@ -120,6 +79,8 @@ class Model:
         saturation: measured state or output -> lowest and highest reading of its sensor. `output` is clipped to it; a state
             is not, as what is measured of it is.
         latency: measured output -> how old a value is when it is recorded, s; no equation depends on it.
+        sensor_delay, sensor_lag: state or output -> how late, and with which time constant its sensor shows it, s, or the
+            parameter that says so. `rhs` and `output` are of what a prompt sensor shows.
         coordinates: in which a transition is integrated; None: the states.
         symbol: casadi.SX, or casadi.MX for large vector models.
 
@@ -148,6 +109,8 @@ class Model:
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     saturation: dict[str, tuple[float, float]] = field(default_factory=dict)
     latency: dict[str, float] = field(default_factory=dict)
+    sensor_delay: dict[str, float | str] = field(default_factory=dict)
+    sensor_lag: dict[str, float | str] = field(default_factory=dict)
     coordinates: Coordinates | None = None
     symbol: Any = casadi.SX
 
@@ -160,8 +123,11 @@ class Model:
 
     def memory(self) -> float:
         """Return how far back inputs act, s: the longest delay and three time constants of the longest lag."""
+        return self._reach(self.delay, self.lag)
+
+    def _reach(self, delay: Mapping[str, float | str], lag: Mapping[str, float | str]) -> float:
         high = {q.name: q.high for q in self.params} | self.fixed
-        ends = [[high[v] if isinstance(v, str) else v for v in times.values()] for times in (self.delay, self.lag)]
+        ends = [[high[v] if isinstance(v, str) else v for v in times.values()] for times in (delay, lag)]
         return max(ends[0], default=0.0) + 3 * max(ends[1], default=0.0)
 
     @property
@@ -171,8 +137,14 @@ class Model:
         return tuple(i for i, linear in enumerate(named) if linear and self.states)
 
     def past(self) -> int:
-        """Return the number of inputs before its own that a transition depends on."""
+        """Return the number of inputs before its own that a transition of the system depends on."""
         return math.ceil(self.memory() / self.dt - TIE)
+
+    def echoes(self) -> int:
+        """Return how many inputs more late sensors show: what a state was is known from what was read and what then acted."""
+        if not (self.inputs and (self.sensor_delay or self.sensor_lag)):
+            return 0
+        return max(math.ceil(self._reach(self.sensor_delay, self.sensor_lag) / self.dt - TIE), 1)
 
     def function(self) -> casadi.Function:
         """Return the CasADi function (x, u, p) -> (dx, y); every argument is a column, empty ones are 0 x 1.
@@ -205,8 +177,7 @@ class Model:
             casadi.Function(f"{self.name}_enter", [x, p], [own.enter(x, p)], ["x", "p"], ["z"]),
             casadi.Function(f"{self.name}_rhs", [z, u, p], [own.rhs(z, u, p)], ["z", "u", "p"], ["dz"]),
             casadi.Function(f"{self.name}_leave", [z, p], [own.leave(z, p)], ["z", "p"], ["x"]),
-            (own.limits[0],) * own.size,
-            (own.limits[1],) * own.size,
+            *own.ends,
         )
 
     @property
@@ -240,6 +211,9 @@ class Declared:
             quantity that is not a state. The reading is scale*expression + bias within `saturates` (null: no end); with `lag`
             (s) it follows as a first-order lag does, and is a state of the model by this name, with this `range`. `delay` (s)
             says how old a reading is when it is recorded, as data.latency does.
+        sensors: state or output: {value, lag, delay}; what its column shows of it. `value` is an expression in its place, in
+            its name and parameters, such as `1.02*x + b`; then it follows with a `lag` and is late by a `delay` (s, or the
+            name of a parameter). All else is about the system itself.
         gap: state or output: expected model error of one transition, in its unit.
 
     Example:
@@ -257,6 +231,7 @@ class Declared:
     tables: dict[str, Any] = field(default_factory=dict)
     dynamics: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
+    sensors: dict[str, Any] = field(default_factory=dict)
     gap: dict[str, Any] = field(default_factory=dict)
 
     symbol: ClassVar[Any] = casadi.SX
@@ -294,11 +269,15 @@ class Declared:
         sensors = read_sensors(self.outputs, self.parameters, least, dt / self.substeps)
         lags = {name: sensor.lag for name, sensor in sensors.items() if sensor.lag is not None}
 
-        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+        def named(p: Symbol) -> dict[str, Symbol]:
             scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
-            for group, column in ((states, x), (inputs, u), (params, p)):
+            return evaluated(derived, scope | {quantity.name: p[row] for row, quantity in enumerate(params)})
+
+        def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
+            scope = named(p)
+            for group, column in ((states, x), (inputs, u)):
                 scope |= {quantity.name: column[row] for row, quantity in enumerate(group)}
-            return evaluated(derived, scope)
+            return scope
 
         def whole(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
             return evaluated(defined, known(x, u, p))
@@ -341,6 +320,7 @@ class Declared:
                 "nothing could be put back; leave limits out"
             )
         model = with_lagging_readings(model, {name: time_constant(lag) for name, lag in lags.items()})
+        model = with_sensors(model, self.sensors, named)
         model.function()  # reads every expression once, so that an error surfaces here and not at first use
         return model
 

@@ -176,21 +176,26 @@ def read_variable(path: str, name: str, node: Any, more: tuple[str, ...] = ()) -
 
 
 def read_times(
-    key: str, inputs: Mapping[str, Any], params: tuple[Quantity, ...], fixed: dict[str, float]
+    key: str,
+    nodes: Mapping[str, Any],
+    params: tuple[Quantity, ...],
+    fixed: dict[str, float],
+    section: str = "inputs",
+    why: str = "an input cannot act before it is given",
 ) -> dict[str, float | str]:
-    """Read the delays or lags of the inputs: a number, or the name of a parameter."""
+    """Read the delays or lags of inputs or sensors: a number, or the name of a parameter."""
     known = {q.name: q.low for q in params} | fixed
     found: dict[str, float | str] = {}
-    for name, node in inputs.items():
+    for name, node in nodes.items():
         if key not in node:
             continue
-        path, value = f"sim.inputs.{name}.{key}", node[key]
+        path, value = f"sim.{section}.{name}.{key}", node[key]
         if isinstance(value, str) and value not in known:
             refuse_unknown(path, f"{value!r} is neither a number (s) nor a parameter", value, known)
         least = known[value] if isinstance(value, str) else read_number(path, value)
         found[name] = value if isinstance(value, str) else least
         if least < 0:
-            raise ModelError(f"{path}: {least:g} s is negative; an input cannot act before it is given")
+            raise ModelError(f"{path}: {least:g} s is negative; {why}")
     return found
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from simulators.definitions import COVARIATE, INTERMEDIATE, KNOWN, UNCERTAIN
 from simulators.quantity import BETWEEN_ROWS, GIVEN, LIMITS, PRIORS, ROLES, VARIABLE
+from simulators.readings import KEYS as READING
 from simulators.sensors import KEYS as SENSOR
 from simulators.tables import DEGREES
 from simulators.tables import KEYS as TABLE
@@ -37,7 +38,8 @@ PROPERTIES: dict[str, Schema] = {
     ),
     "column": {"type": "string", "description": "Column of the measurements that knows the parameter in every row."},
     "prior": {"enum": list(PRIORS), "description": "Law of an uncertain parameter; normal: the range is +-2 sd."},
-    "value": TERM | {"description": "Of a parameter: the known number. Of an input: the expression in its place."},
+    "value": TERM
+    | {"description": "Of a parameter: the known number. Of an input or a sensor: the expression in its place."},
     "expression": TERM,
     "scale": NUMBER_OR_NAME | {"description": "Factor of the reading."},
     "bias": NUMBER_OR_NAME | {"description": "Added to the reading."},
@@ -92,6 +94,8 @@ def either(*options: Schema) -> Schema:
 
 _OUTPUT = keys(SENSOR, ("expression",))
 _OUTPUT["properties"]["delay"] = NUMBER | {"description": "How old a reading is when it is recorded, s."}
+_READING = keys(READING)
+_READING["properties"]["delay"] = NUMBER_OR_NAME | {"description": "How late its sensor shows it, s, or a parameter."}
 _PARAMETER = {"required": ["range"]}, {"required": ["value"]}
 PARAMETER = either(TERM, keys(dict.fromkeys((*UNCERTAIN, *KNOWN, *COVARIATE))) | {"anyOf": list(_PARAMETER)})
 GAP = named(NUMBER)
@@ -104,5 +108,6 @@ SECTIONS: dict[str, Schema] = {
     "tables": named(keys(TABLE, ("inputs",))),
     "dynamics": named(TERM),
     "outputs": named(either(TERM, _OUTPUT)),
+    "sensors": named(_READING),
     "gap": GAP,
 }

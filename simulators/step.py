@@ -15,7 +15,8 @@ def one_step(model: Model) -> casadi.Function:
     `x` are the states; `u` the inputs of this step and of the `model.past()` steps before it, oldest first, then the inputs of
     the next step that are linear between rows (`model.linear`), in one column; `p` the uncertain parameters. `next` are the
     states one `dt` later, integrated as a fit does (classical Runge-Kutta with `model.substeps`; an angle is not wrapped), `y`
-    the outputs now, with the inputs that act from now on (a late one as it arrives).
+    the outputs now, with the inputs that act from now on (a late one as it arrives). Both are what sensors show but for their
+    lags and delays (`model.sensor_lag`, `model.sensor_delay`).
 
     """
     du, past = len(model.inputs), model.past()

@@ -1,6 +1,6 @@
 """Inputs as a model sees them: with its own delays and lags, over the substeps of rows."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +12,15 @@ from simulators.model import Model
 
 def seconds(model: Model, times: dict[str, float | str], phi: Float[Array, " dp"]) -> Float[Array, " du"]:
     """Return the delay or the lag of every input, s; `times`: of the model, input -> a number or a parameter's name."""
-    names = [q.name for q in model.params]
-    values = {**model.fixed, **{name: phi[i] for i, name in enumerate(names)}}
-    each = [times.get(q.name, 0.0) for q in model.inputs]
+    return values_of(model, times, [q.name for q in model.inputs], phi)
+
+
+def values_of(
+    model: Model, times: Mapping[str, float | str], names: Sequence[str], phi: Float[Array, " dp"]
+) -> Float[Array, " n"]:
+    """Return the time of every named signal, s, 0 where none is given; `times`: name -> a number or a parameter's name."""
+    values = {**model.fixed, **{q.name: phi[i] for i, q in enumerate(model.params)}}
+    each = [times.get(name, 0.0) for name in names]
     return jnp.stack([jnp.asarray(values[v] if isinstance(v, str) else v, phi.dtype) for v in each])
 
 

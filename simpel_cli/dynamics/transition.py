@@ -2,7 +2,8 @@
 
 (x, phi) -> y = [enc(F(s, u; phi)) - enc(s), g(s, u; phi)],   F = RK4 of the model over dt
 
-g reads the inputs that act from the row on: a late one as it arrives.
+g reads the inputs that act from the row on: a late one as it arrives. Where sensors are late, s is what they show
+(`late_readings`).
 """
 
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from simpel_cli.dynamics.casadi_jax import checked
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.input_delay import prompt_inputs
 from simpel_cli.dynamics.integrate import State, rk4_step
+from simpel_cli.dynamics.late_readings import late_of
 from simpel_cli.errors import ConfigError
 from simulators.groups import slots_of
 from simulators.model import Model, Quantity
@@ -69,29 +71,48 @@ def transition(model: Model, encoding: Encoding) -> Transition:
     """
     ranges = [[(q.low, q.high) for q in group] for group in (model.states, model.inputs, model.params)]
     # outputs are read off the whole function; a transition is integrated in the model's own coordinates
-    measure = checked(model.function(), ranges) if encoding.outputs or not model.states else None
+    shows = bool(encoding.outputs or not model.states or model.sensor_delay or model.sensor_lag)
+    measure = checked(model.function(), ranges) if shows else None
     integrated = _integrated(model, ranges) if model.states else None
     rows = [[q.name for q in model.outputs].index(q.name) for q in encoding.outputs]
 
-    needed = model.past()
+    echoes = model.echoes()
+    needed = model.past() + echoes
     if needed > encoding.stack:
+        acts = f"inputs of {model.name} act up to {model.memory():.3g} s later"
+        shown = f"late sensors of {model.name} show what inputs did before"
         raise ConfigError(
-            f"data.stack_actions: {encoding.stack}, but inputs of {model.name} act up to {model.memory():.3g} s later: a "
-            f"transition needs the {needed} inputs before its own. Use data.stack_actions={needed}."
+            f"data.stack_actions: {encoding.stack}, but {acts if not echoes else shown}: a transition needs the {needed} "
+            f"inputs before its own. Use data.stack_actions={needed}."
         )
-    late = bool(model.delay or model.lag)
+    late_inputs = bool(model.delay or model.lag)
+    late = late_of(model, measure) if measure is not None else None
+    before = max(echoes, int(late is not None))
+
+    def acting_of(u: Float[Array, "R du"], phi: Float[Array, " dp"]) -> Float[Array, "T substeps K du"]:
+        """Return the inputs of the substeps of the row in question and, where sensors are late, of those before."""
+        if late_inputs:
+            return arriving(model, u, phi, encoding.stack - before)
+        first = [max(encoding.stack - k, 0) for k in range(before, -1, -1)]  # without inputs no past is needed
+        return jnp.stack([prompt_inputs(u[k : k + 2], model.substeps, model.linear) for k in first])
 
     def step(x: Float[Array, " dx"], phi: Float[Array, " dp"]) -> Float[Array, " dy"]:
-        state, stacked = encoding.split_x(x)
+        read, stacked = encoding.split_x(x)
         u = encoding.input_rows(stacked)
-        acting = arriving(model, u, phi, encoding.stack)[0] if late else None
-        now = encoding.inputs_now(stacked) if acting is None else acting[0, 0]
-        outputs = measure(state, now, phi)[1][jnp.array(rows, int)] if measure is not None and rows else state[:0]
+        acting = acting_of(u, phi) if late_inputs or late is not None else None
+        now = encoding.inputs_now(stacked) if acting is None else acting[-1, 0, 0]
+        state = read if late is None or acting is None else late.meant(read, acting[:-1], phi)
+        outputs = measure(state, now, phi)[1] if measure is not None and rows else state[:0]
+        if late is not None and acting is not None and rows:
+            outputs = outputs + late.behind(state, acting[:-1], phi, now)[len(read) :]
+        outputs = outputs[jnp.array(rows, int)] if rows else outputs
         if integrated is None:
-            return encoding.to_y(state, state, outputs)
-        if acting is None:
-            acting = prompt_inputs(u[encoding.stack :], model.substeps, model.linear)
-        return encoding.to_y(state, integrated(state, acting, phi), outputs)
+            return encoding.to_y(read, read, outputs)
+        own = prompt_inputs(u[encoding.stack :], model.substeps, model.linear) if acting is None else acting[-1]
+        after = integrated(state, own, phi)
+        if late is not None and acting is not None:
+            after = after + late.behind(after, acting[1:], phi)[: len(read)]
+        return encoding.to_y(read, after, outputs)
 
     width = model.coordinates.size if model.coordinates is not None else len(model.states)
     return Transition(encoding, model.params, model.gap, step, width)

@@ -23,6 +23,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.dynamics.arriving import acting
+from simpel_cli.dynamics.late_readings import behind
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.even_rows import even_times, inputs_at, moved, uneven
 from simpel_cli.filtering.initial_states import begun
@@ -218,11 +219,11 @@ def _made(
     found = found._replace(smooth=_on_from_row_to_row(found.smooth, model))
     values = np.concatenate([episode.states, episode.outputs], axis=1)
     there = np.isfinite(values)
-    smoothed = np.concatenate([found.smooth, _read(model, found.smooth, episode, p, plan)], axis=1)
+    smoothed = _shown(found.smooth, episode, p, plan)
     estimate, variance = smoothed.copy(), found.smooth_var
     if kept is not None and kept.any():
         # what comes next is what is tested: only what nothing measures looks back at it
-        filtered = np.concatenate([found.filtered, _read(model, found.filtered, episode, p, plan)], axis=1)
+        filtered = _shown(found.filtered, episode, p, plan)
         estimate = np.where(kept[None], filtered, smoothed)
         variance = np.where(kept[None, :n_states], found.filtered_var, found.smooth_var)
     for i, q in enumerate(model.states):
@@ -238,8 +239,7 @@ def _made(
         rates = partial(_rates, model, p)
         felt = acting(model, np.nan_to_num(episode.inputs), p[: len(model.params)])
         there_then = found.smooth + moved(episode.time, time, found.smooth, felt, model.linear, rates)
-        read = _read(model, there_then, episode._replace(inputs=inputs), p, plan)
-        shift = np.nan_to_num(np.concatenate([there_then, read], axis=1) - smoothed)
+        shift = np.nan_to_num(_shown(there_then, episode._replace(inputs=inputs), p, plan) - smoothed)
         at_an_end = np.zeros(values.shape, bool) if episode.beyond is None else episode.beyond != 0
         values, estimate = values + np.where(at_an_end, 0.0, shift), estimate + shift
     weight = np.full(values.shape, NOTHING)
@@ -280,16 +280,21 @@ def _once_known(whole: Episode, measured: Episode, kept: np.ndarray) -> Episode:
     return type(whole)(whole.name, *(a if a is None else a[first:] for a in whole[1:]))  # type: ignore[arg-type]
 
 
-def _read(model: Model, states: np.ndarray, episode: Episode, p: np.ndarray, plan: Setup) -> np.ndarray:
-    """Return what the simulator's outputs are at states, those that were measured, (T, n_outputs)."""
-    if not episode.outputs.shape[1]:
-        return np.empty((len(states), 0))
-    names = [q.name for q in model.outputs]
-    columns = [names.index(name) for name in plan.augmented.measured if name in names]
-    at = np.tile(p[: len(model.params), None], (1, len(states)))
-    inputs = acting(model, np.nan_to_num(episode.inputs), p[: len(model.params)])
-    read = np.asarray(model.function().map(len(states))(states.T, inputs.T, at)[1])
-    return read.T[:, columns]
+def _shown(states: np.ndarray, episode: Episode, p: np.ndarray, plan: Setup) -> np.ndarray:
+    """Return what the columns of states and measured outputs show at states, (T, nx + n_outputs)."""
+    model = plan.augmented.model
+    own = p[: len(model.params)]
+    inputs = acting(model, np.nan_to_num(episode.inputs), own)
+    names = [q.name for q in (*model.states, *model.outputs)]
+    columns = [
+        *range(len(model.states)),
+        *(names.index(n) for n in plan.augmented.measured if n in names[len(model.states) :]),
+    ]
+    at = np.tile(own[:, None], (1, len(states)))
+    read = np.asarray(model.function().map(len(states))(states.T, inputs.T, at)[1]).reshape(
+        len(model.outputs), len(states)
+    )
+    return (np.concatenate([states, read.T], axis=1) + behind(model, states, inputs, own))[:, columns]
 
 
 def _rates(model: Model, p: np.ndarray, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:

@@ -15,7 +15,16 @@ from simpel_cli.filtering.measurements import windows as windows_
 from simpel_cli.filtering.measurements.integration_steps import substeps_needed
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
 from simulators.effects import Expression, Scales, Term, unnamed
-from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, RATE_LIMIT, EffectParameter
+from simulators.effects.term import (
+    BACKLASH,
+    BETWEEN_ROWS,
+    DELAY,
+    LAG,
+    RATE_LIMIT,
+    SENSOR_DELAY,
+    SENSOR_LAG,
+    EffectParameter,
+)
 from simulators.model import Model, ModelError
 
 LEAST_ROWS = 30  # of all training episodes: below, a search would only read noise
@@ -152,8 +161,8 @@ def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], 
         named = [t for e in effects for t in e.attach(model, scales, measured)]
     except ModelError as error:
         raise ConfigError(str(error)) from error
-    # what is late already is calibrated: a second delay of the same input could not be distinguished from the first
-    late = {DELAY: model.delay, LAG: model.lag}
+    # what is late already is calibrated: a second delay of the same signal could not be distinguished from the first
+    late = {DELAY: model.delay, LAG: model.lag, SENSOR_DELAY: model.sensor_delay, SENSOR_LAG: model.sensor_lag}
     return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
 
 

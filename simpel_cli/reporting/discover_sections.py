@@ -10,6 +10,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
 from simpel_cli.discovery.verdict.remainder import dependence
+from simpel_cli.reporting.equations import of_sensors
 from simpel_cli.reporting.figures import draw_discover
 from simpel_cli.reporting.figures.canvas import with_interval, with_unit
 from simpel_cli.reporting.figures.discover_runs import models_of
@@ -143,7 +144,7 @@ def _as_in(sim: Mapping[str, Any]) -> str:
 
 
 def _timing(sim: Mapping[str, Any]) -> list[str]:
-    """Describe parameters that differ, and inputs that act differently from their recorded values: changed or late."""
+    """Describe parameters that differ, inputs that act differently from their recorded values, and what sensors show."""
     lines = _timing(base) if isinstance(base := sim.get("base"), Mapping) else []
     for name, node in (sim.get("parameters") or {}).items():
         if isinstance(node, Mapping) and "per" in node:
@@ -155,7 +156,7 @@ def _timing(sim: Mapping[str, Any]) -> list[str]:
             lines.append(f"{name} acts as {name}(t - {node['delay']})")
         if "lag" in node:
             lines.append(f"{name} acts through a first-order lag with time constant {node['lag']}")
-    return lines
+    return lines + of_sensors(sim)
 
 
 def marked(old: str, new: str) -> list[tuple[str, bool]]:

@@ -20,14 +20,15 @@ def equations(sim: Mapping[str, Any]) -> list[str]:
         lines = equations(base)
         inputs = {k: v for k, v in (sim.get("inputs") or {}).items() if isinstance(v, Mapping) and "value" in v}
         lines += [f"{name} acts as {node['value']}" for name, node in inputs.items()]
-        return lines + [f"d{name}/dt = rate_{name} + {term}" for name, term in (sim.get("dynamics") or {}).items()]
+        lines += [f"d{name}/dt = rate_{name} + {term}" for name, term in (sim.get("dynamics") or {}).items()]
+        return lines + of_sensors(sim)
     parameters = sim.get("parameters") or {}
     lines = [f"{name} = {node}" for name, node in parameters.items() if isinstance(node, str)]
     lines += [f"{name} = {_expression(node)}{_unit(node)}" for name, node in (sim.get("intermediates") or {}).items()]
     for name, node in (sim.get("tables") or {}).items():
         lines.append(f"{name} = table of {', '.join(map(str, node['inputs']))}{_unit(node)}")
     lines += [f"d{name}/dt = {formula}" for name, formula in (sim.get("dynamics") or {}).items()]
-    return lines + [_reading(name, node) for name, node in (sim.get("outputs") or {}).items()]
+    return lines + [_reading(name, node) for name, node in (sim.get("outputs") or {}).items()] + of_sensors(sim)
 
 
 def tables(sim: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -81,6 +82,21 @@ def _reading(name: str, node: Any) -> str:
     if "saturates" in own:
         low, high = ("no end" if end is None else str(end) for end in own["saturates"])
         extra.append(f"saturates at {low} and {high}")
-    if "lag" in own:
-        extra.append(f"follows with a lag of {own['lag']}" + ("" if isinstance(own["lag"], str) else " s"))
+    extra += [f"follows with a lag of {_seconds(own['lag'])}"] if "lag" in own else []
     return f"{name} = {text}{_unit(node)}" + (f"   ({'; '.join(extra)})" if extra else "")
+
+
+def of_sensors(sim: Mapping[str, Any]) -> list[str]:
+    """Return what the columns of states and outputs show: `the sensor of NAME shows VALUE`, its lag and its delay."""
+    lines = []
+    for name, node in (sim.get("sensors") or {}).items():
+        extra = [f"follows with a lag of {_seconds(node['lag'])}"] if "lag" in node else []
+        extra += [f"is late by {_seconds(node['delay'])}"] if "delay" in node else []
+        lines.append(
+            f"the sensor of {name} shows {node.get('value', name)}" + (f"   ({'; '.join(extra)})" if extra else "")
+        )
+    return lines
+
+
+def _seconds(time: Any) -> str:
+    return str(time) if isinstance(time, str) else f"{time} s"

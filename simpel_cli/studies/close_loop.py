@@ -26,7 +26,7 @@ Summary = dict[str, dict[str, dict[str, list[float]]]]
 
 def past_inputs(source: Source) -> int:
     """Return the number of past inputs that a transition of a simulator needs."""
-    return source.past() if isinstance(source, Model) else 0
+    return source.past() + source.echoes() if isinstance(source, Model) else 0
 
 
 def close(declared: Declared, corrected: Declared, directory: Path, data_folder: Path, terminal: Terminal) -> Summary:

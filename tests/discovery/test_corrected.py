@@ -1,4 +1,4 @@
-"""The corrected YAML against the model that the search fitted: the same rates at random points."""
+"""The corrected YAML against the model that the search fitted: the same rates and readings at random points."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +9,7 @@ import yaml
 
 from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
+from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict import corrected as module
@@ -33,17 +34,25 @@ def node_of(group: str, name: str) -> dict[str, Any]:
 
 
 def written(
-    sim: str | dict[str, Any], effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    sim: str | dict[str, Any],
+    effects: tuple[str | dict[str, Any], ...],
+    monkeypatch: pytest.MonkeyPatch,
+    measured: tuple[str, ...] = (),
 ) -> tuple[Model, list[Term], dict[str, Any], list[str]]:
     """Return the model, the terms, the corrected YAML with the terms at their starts, and what was left out."""
     node = node_of("sim", sim) if isinstance(sim, str) else sim
     model = build(node, "sim").model()
     scales = Scales(
-        {q.name: 1.0 for q in (*model.states, *model.inputs)}, {q.name: 2.0 for q in model.states}, model.dt
+        {q.name: 1.0 for q in (*model.states, *model.inputs, *model.outputs)},
+        {q.name: 2.0 for q in model.states},
+        model.dt,
     )
     names = [q.name for q in model.states]
     terms: list[Term] = [
-        build(node_of("effect", e), "effect").attach(model, scales, tuple(names[:1]))[0] for e in effects
+        build(node_of("effect", e) if isinstance(e, str) else e, "effect").attach(
+            model, scales, measured or tuple(names[:1])
+        )[0]
+        for e in effects
     ]
     parameters = [k for t in terms for k in t.parameters]
     rows = [[parameters.index(k) for k in t.parameters] for t in terms]
@@ -52,7 +61,7 @@ def written(
     # the order in which terms were accepted is not that in which they were attached
     search = Search.__new__(Search)
     search.terms, search.rows = tuple(terms), [tuple(r) for r in rows]
-    search.plan = SimpleNamespace(augmented=SimpleNamespace(params=(), model=model))
+    search.plan = SimpleNamespace(augmented=SimpleNamespace(params=(), model=model, measured=measured or tuple(names)))
     nothing = Optimum(np.zeros(1), (), 0.0, 0.0, np.zeros(0), np.eye(1), np.zeros(0), np.eye(1), 0, True)
     trial = Trial(tuple(reversed(range(len(terms)))), nothing)
     _, corrected, left_out = module.corrected(node, model, search, trial)
@@ -131,18 +140,66 @@ def test_intermediates_tables_roles_and_sensors_are_carried_on(monkeypatch: pyte
     assert SHAFT["tables"]["torque"]["inputs"] == ["u", "n"]  # what was declared is not changed
 
 
-LATE = ("input_backlash", "sensor_lag", "input_lag", "actuator_rate_limit", "sensor_saturation")
-LEFT_OUT = (
-    ("sensor_saturation", "phi"), ("actuator_rate_limit", "u"), ("sensor_lag", "phi"), ("input_backlash", "u"),
-)  # fmt: skip
+ON_SENSORS = ("sensor_scale", "sensor_bias", "sensor_lag", "sensor_delay", "coulomb_friction", "input_offset")
+
+
+@pytest.mark.parametrize(
+    ("sim", "place"),
+    [("pendulum", "omega"), ("shaft", "amps"), ("shaft", "tacho"), ("in Python", "n"), ("with sensors", "n")],
+)
+def test_sensors_show_what_was_fitted(sim: str, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a sensor shows, and its rate, are those of the model that was fitted."""
+    seen = {"name": "seen", **SHAFT, "sensors": {"n": {"value": "1.5*n - 0.4"}}}
+    node: Any = {
+        "shaft": SHAFT,
+        "in Python": {"_target_": module.EXTENDED, "name": "more", "base": SHAFT},
+        "with sensors": seen,
+    }.get(sim, sim)
+    model, terms, corrected, left_out = written(node, ON_SENSORS, monkeypatch, (place,))
+    assert left_out == []
+    new = build(corrected, "sim").model()
+    times = [new.fixed[of[place]] for of in (new.sensor_lag, new.sensor_delay)]  # type: ignore[index]
+    assert times == [t.parameters[0].starts[0] for t in terms[2:4]]
+    together = augment(model, terms, [q.name for q in (*model.states, *model.outputs)]).function
+    names = [q.name for q in (*model.states, *model.outputs)]
+    random, parameters = np.random.default_rng(0), [k.starts[0] for t in terms for k in t.parameters]
+    for _ in range(5):
+        x, u, p = (
+            [random.uniform(q.low, q.high) for q in group] for group in (model.states, model.inputs, model.params)
+        )
+        rates, shown = (np.asarray(part).ravel() for part in together(x, u, [*p, *parameters]))
+        read = shown[: len(x)]
+        own, outputs = (np.asarray(part).ravel() for part in new.function()(read, u, p))
+        scale = [1.02 if name == place else 1.0 for name in names[: len(x)]]
+        np.testing.assert_allclose(own, rates * scale, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(outputs, shown[len(x) :], rtol=1e-9, atol=1e-9)
+        assert abs(shown[names.index(place)] - np.asarray([*x, *outputs])[names.index(place)]) > 1e-3 or place == "amps"
+
+
+def test_a_speed_that_is_not_measured_has_the_sensor_of_its_position(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, _, corrected, _ = written("pendulum", ("sensor_bias", "sensor_scale", "sensor_lag"), monkeypatch, ("phi",))
+    assert corrected["sensors"] == {
+        "phi": {"value": "(phi + b)*(1 + a)", "lag": "tau"},
+        "omega": {"value": "omega*(1 + a)", "lag": "tau"},
+    }
+    assert speeds(build(corrected, "sim").model()) == {"omega": ["phi"]}
 
 
 def test_what_a_transition_cannot_hold_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _, corrected, left_out = written("pendulum", LATE, monkeypatch)
+    crooked = {"name": "crooked", "acts_on": "measured", "term": "y + c*y**3", "parameters": {"c": {"range": [0, 1]}}}
+    model, _, corrected, left_out = written(
+        "pendulum", ("input_backlash", crooked, "input_lag", "actuator_rate_limit", "sensor_saturation"), monkeypatch
+    )
     new = build(corrected, "sim").model()
     assert new.lag == {"u": "tau"}
     assert model.lag == {}
-    assert [text.split(" (")[0] for text in left_out] == [f"{e} on {p}" for e, p in LEFT_OUT]
+    assert "sensors" not in corrected
+    assert [text.split(" (")[0] for text in left_out] == [
+        "sensor_saturation on phi",
+        "crooked on phi",
+        "actuator_rate_limit on u",
+        "input_backlash on u",
+    ]
     assert all(len(text.split(" (")[1]) > 30 for text in left_out)
 
 

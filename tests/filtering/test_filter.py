@@ -1,5 +1,7 @@
 """The filter against the exact Gaussian law of a linear system, and its derivatives against differences."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import Setup, setup
 from simulators.effects import Expression
 from simulators.model import Declared
+from simulators.quantity import Quantity
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +100,28 @@ def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: fl
         errors.append(np.abs(read - (end + (v_0 - end) * motion)).max())
     assert errors[0] < 5e-5
     assert 6 < errors[0] / errors[1] < 10  # third order in the time
+
+
+def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> None:
+    late, lag = 0.06, 0.1
+    effects = [
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        for kind in ("sensor_delay", "sensor_lag")
+    ]
+    found = setup(model(), recording(), (), effects, 2)
+    names = [q.name for q in found.augmented.params]
+    p = p_of_plan(found, A, B)
+    p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late, lag
+    declared = replace(model(), sensor_delay={"v": late}, sensor_lag={"v": "tau"})
+    declared = replace(declared, params=(*declared.params, Quantity("tau", "s", 0, 1)))
+    own = setup(declared, recording(), (), effects, 2)
+    assert [t.label for t in own.augmented.terms if t.kind in ("sensor_delay", "sensor_lag")] == []
+    noise = Noise(jnp.full(2, 0.05), jnp.array([0.0, 0.3]))
+    tracks = []
+    for plan, at in ((found, p), (own, p_of_plan(own, A, B, lag))):
+        data = [jnp.asarray(getattr(plan.windows, name)[1]) for name in ("y", "ok", "u", "start", "spread")]
+        tracks.append(np.asarray(plan.rule.track(jnp.asarray(at), noise, *data)[0].innovation))
+    np.testing.assert_allclose(tracks[0], tracks[1], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("late", "lag"), [(0.0, 0.06), (0.06, 0.0), (0.1, 0.1), (0.3, 0.0), (0.25, 0.1)])

@@ -4,22 +4,26 @@ import itertools
 import re
 from typing import Any
 
+import casadi
+
+from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict.groups import differing, spread_of
 from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simulators.effects import Term
-from simulators.effects.term import BACKLASH, DELAY, LAG, ON_SENSOR, RATE_LIMIT, SENSOR
-from simulators.model import Declared, Model
+from simulators.effects.term import BACKLASH, DELAY, LAG, ON_SENSOR, RATE_LIMIT, SENSOR, SENSOR_DELAY
+from simulators.model import Declared, Model, ModelError
 from simulators.quantity import READING
+from simulators.readings import line_of
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
 STIFF = 8  # Runge-Kutta steps per row: groups at the far end of a population move faster than any that was seen
 NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
-_SENSOR = "a simulator describes the system, not its sensors: correct the measurements instead"
-CANNOT = dict.fromkeys((SENSOR, *ON_SENSOR), _SENSOR) | {
+PAST = {
     BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain",
     RATE_LIMIT: "where the actuator is depends on all past inputs, which a single transition does not contain",
 }
+FOLLOWS = "a lagging reading follows what it reads by a law of its own, to which nothing is added"
 
 
 def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
@@ -42,7 +46,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
     taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
     readings = {q.name for q in model.states if q.role == READING}
-    cannot = {t: _SENSOR if readings & t.rates.keys() else CANNOT.get(t.kind) for t in terms}
+    cannot = {t: FOLLOWS if readings & t.rates.keys() else PAST.get(t.kind) or no_line(t, model) for t in terms}
     spread = {one.row: one for one in differing(search, trial)}
     written: list[Term] = []
     names: dict[str, str] = {}
@@ -68,8 +72,11 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             if row in spread and low < high:
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
-    write = _declared if sim.get("_target_", DECLARED) == DECLARED else _extended
-    node = write(sim, name, written, names, parameters)
+    # where sensors are declared, terms act on what these show
+    plain = sim.get("_target_", DECLARED) == DECLARED and not sim.get("sensors")
+    node = (_declared if plain else _extended)(sim, name, written, names, parameters)
+    sensors = shown(written, names, model, search.plan.augmented.measured)
+    node |= {"sensors": sensors} if sensors else {}
     return name, node, [f"{t.label} ({cannot[t]})" for t in terms if cannot[t]]
 
 
@@ -123,6 +130,65 @@ def _declared(
             swap = names | given | (rates if term.several else {"rate": rates[f"rate_{state}"]})
             node["dynamics"][state] += f" + ({_renamed(text, swap)})"
     return node
+
+
+def no_line(term: Term, model: Model) -> str | None:
+    """Return why a simulator cannot show what a sensor shows; None: it can, or the term is about something else."""
+    if term.kind != SENSOR:
+        return None
+    try:
+        _line(term, model)
+    except ModelError:
+        return f"a simulator shows a factor of {term.acts_on} and an offset, which depend on nothing but parameters"
+    return None
+
+
+def shown(
+    terms: list[Term], names: dict[str, str], model: Model, measured: tuple[str, ...]
+) -> dict[str, dict[str, str]]:
+    """Return the section `sensors` of the corrected simulator.
+
+    A speed that is not measured is read off what the sensor of its position shows: it has its factor, its lag and its delay.
+
+    Args:
+        terms: that are written.
+        names: unique name of a parameter -> the one in the YAML.
+        model: the simulator.
+        measured: names of the measured states and outputs.
+    """
+    found: dict[str, dict[str, str]] = {}
+    of_position = {p: v for v, positions in speeds(model).items() if v not in measured for p in positions}
+    for term in terms:
+        if term.kind not in (SENSOR, *ON_SENSOR):
+            continue
+        for place in (term.acts_on, *(v for p, v in of_position.items() if p == term.acts_on)):
+            own = found.get(place, {})
+            if term.kind in ON_SENSOR:
+                key = "delay" if term.kind == SENSOR_DELAY else "lag"
+                found[place] = own | {key: names[term.parameters[0].name]}
+                continue
+            before = own.get("value", place)
+            at = {term.acts_on: before if before.isidentifier() else f"({before})"}
+            value = _renamed(term.expression, names | at)
+            if place != term.acts_on:
+                slope, offset = _line(term, model)
+                if slope.is_one():
+                    continue
+                value += "" if offset.is_zero() else f" - ({_renamed(term.expression, names | {term.acts_on: '0'})})"
+            found[place] = own | {"value": value}
+    return found
+
+
+def _line(term: Term, model: Model) -> Any:
+    """Return factor and offset of what a sensor shows, in symbols.
+
+    Raises:
+        ModelError: it is no line, or depends on more than parameters.
+    """
+    names = [q.name for q in model.params] + [k.name for k in term.parameters]
+    scope = {name: casadi.SX.sym(name) for name in names}
+    scope |= {name: casadi.SX(value) for name, value in model.fixed.items()}
+    return line_of("", term.expression, term.acts_on, scope, casadi.SX)
 
 
 def _look_up_changed_inputs(node: dict[str, Any], given: dict[str, str]) -> None:

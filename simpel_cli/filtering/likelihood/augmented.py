@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from simulators.effects import Structure, Term, structure
-from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, SENSOR
+from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, SENSOR, SENSOR_DELAY, SENSOR_LAG
 from simulators.expression import parse
 from simulators.model import Model, Quantity
 
@@ -30,6 +30,7 @@ class Augmented(NamedTuple):
         operators: kind -> (index of the signal, row of p) for delays, lags and plays, of the model and of the terms.
         own_delay: (nu) known delays of the model, s.
         own_lag: (nu) known lags, s.
+        own_late: (ny) known delays of the sensors, s, and (ny) known lags.
         roles: of the states.
     """
 
@@ -42,6 +43,7 @@ class Augmented(NamedTuple):
     operators: dict[str, tuple[tuple[int, int], ...]]
     own_delay: tuple[float, ...]
     own_lag: tuple[float, ...]
+    own_late: tuple[tuple[float, ...], tuple[float, ...]]
     roles: Structure
 
     def rows(self, term: Term) -> list[int]:
@@ -121,14 +123,19 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
             (signals.index(t.acts_on), columns.index(t.parameters[0].name)) for t in terms if t.kind == kind
         )
     constant: dict[str, tuple[float, ...]] = {}
-    for kind, times in ((DELAY, model.delay), (LAG, model.lag)):
-        each = [times.get(q.name, 0.0) for q in model.inputs]
+    driven = tuple(q.name for q in model.inputs)
+    for kind, times, late in (
+        (DELAY, model.delay, driven),
+        (LAG, model.lag, driven),
+        (SENSOR_DELAY, model.sensor_delay, measured),
+        (SENSOR_LAG, model.sensor_lag, measured),
+    ):
+        each = [times.get(name, 0.0) for name in late]
         operators[kind] += tuple((j, columns.index(v)) for j, v in enumerate(each) if v in columns)
         constant[kind] = tuple(0.0 if v in columns else float(model.fixed.get(str(v), v)) for v in each)
     return Augmented(
         model, tuple(terms), tuple(measured), function, tuple(params), np.array(neutral), operators, constant[DELAY],
-        constant[LAG],
-        structure(model),
+        constant[LAG], (constant[SENSOR_DELAY], constant[SENSOR_LAG]), structure(model),
     )  # fmt: skip
 
 

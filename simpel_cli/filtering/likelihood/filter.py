@@ -56,8 +56,8 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     model = augmented.model
     key = (
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
-        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag, model.linear,
-        substeps, lead,
+        augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag,
+        augmented.own_late, model.linear, substeps, lead,
     )  # fmt: skip
     if key not in _KEPT:
         name = hashlib.sha256(repr(key).encode()).hexdigest()
@@ -163,11 +163,12 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         return jax.lax.scan(step, (x, unit, *nothing), u)
 
-    late_ones = bool(sensor_delays or sensor_lags)
+    own_delays, own_lags = augmented.own_late
+    late_ones = bool(sensor_delays or sensor_lags or any(own_delays) or any(own_lags))
 
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
-        return per_signal(p, sensor_delays, ny), per_signal(p, sensor_lags, ny)
+        return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
     def seen(
         p: Array,

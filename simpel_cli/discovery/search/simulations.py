@@ -1,0 +1,115 @@
+"""A search by what a model is worth as a simulator: every episode is one simulation, and what it leaves has a memory.
+
+One row ahead a wrong model may do as well as the right one, if noise of the process makes up for it; where the states are not
+all measured, it may do better. So a model that will be used for simulations is searched for by those, with the same effects,
+evidence and gates. What was found is then said in the coordinates of the ordinary search, in which the noise alone is fitted
+once more: residuals, errors ahead and what is left are looked at there.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.smaller import carried, names_of
+from simpel_cli.discovery.search.trials import Search, Stage, Trial
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.setup import Setup
+
+
+def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter: Callable[[Setup], Fitter]) -> Search:
+    """Return the search by simulations in the windows of an ordinary one.
+
+    Args:
+        found: the ordinary search.
+        base: its calibrated simulator.
+        attach: returns the setup with the same effects in which episodes are simulations.
+        fitter: of a setup.
+    """
+    plan, old = attach(), found.plan
+    windows = plan.windows._replace(
+        ok=old.windows.ok, start=plan.windows.start.copy(), spread=plan.windows.spread.copy()
+    )
+    known = len(old.augmented.model.states)
+    windows.start[:, :known], windows.spread[:, :known] = old.windows.start, old.windows.spread
+    plan = plan._replace(windows=windows, spare=None)
+    plan = plan._replace(optimum=_begun(old, base.optimum.z, plan))
+    search = Search(plan, fitter(plan).on(windows), found.report)
+    search.budget, search.banned = found.budget, set(found.banned)
+    return search
+
+
+def _begun(old: Setup, z: np.ndarray, plan: Setup) -> np.ndarray:
+    """Return a start at the parameters of the ordinary calibration: of the noise nothing is known yet."""
+    start = carried(old, z, plan)
+    n_p = plan.coordinates.sizes[0]
+    start[n_p:] = plan.start[n_p:]
+    return start
+
+
+def in_rows(simulated: Search, selection: Selection, search: Search) -> Selection:
+    """Return what a search by simulations found in the coordinates of the ordinary search.
+
+    Parameters are as the simulations say, and as certain; levels of noise are fitted anew; evidence of a set is that of the
+    ordinary search there, gains are those of the simulations.
+    """
+    sets = {frozenset(t.terms): t for t in (selection.base, selection.chosen, *selection.path)}
+    moved = [_moved(simulated, t, search) for t in sets.values()]
+    noise = search.fitter([Hypothesis(t.optimum.z, search.noise, search.ones) for t in moved])
+    here = search.fitter(
+        [Hypothesis(o.z, search.free(t.terms), search.ones) for t, o in zip(moved, noise, strict=True)], 1
+    )
+    search.known.clear()
+    search.asked.clear()
+    search.banned = simulated.banned
+    search.tried += simulated.tried
+    for trial, optimum in zip(moved, here, strict=True):
+        search.known[frozenset(trial.terms)] = _as_certain(optimum, trial.optimum)
+    own = lambda t: Trial(t.terms, search.known[frozenset(t.terms)])  # noqa: E731
+    return selection._replace(
+        base=own(selection.base),
+        chosen=own(selection.chosen),
+        path=tuple(own(t) for t in selection.path),
+        classes=tuple(tuple(_moved(simulated, t, search) for t in rivals) for rivals in selection.classes),
+        stages=tuple(
+            Stage(
+                _moved(simulated, s.before, search), tuple(_moved(simulated, t, search) for t in s.trials), s.screened
+            )
+            for s in selection.stages
+        ),
+    )
+
+
+def _moved(simulated: Search, trial: Trial, search: Search) -> Trial:
+    """Return a fit in other coordinates, by the names of its unknowns; its evidence is as it was."""
+    names, known = names_of(search.plan), names_of(simulated.plan)
+    optimum, free = trial.optimum, search.free(trial.terms)
+    row = {known[i]: k for k, i in enumerate(optimum.free)}
+    there = [row.get(names[i]) for i in free]
+    z = carried(simulated.plan, optimum.z, search.plan)
+    n_p, n_r, _ = search.plan.coordinates.sizes
+    z[n_p + n_r : -1] = search.plan.start[n_p + n_r : len(z) - 1]
+
+    def picked(values: np.ndarray, default: Sequence[float]) -> np.ndarray:
+        return np.array([d if k is None else values[k] for k, d in zip(there, default, strict=True)])
+
+    inside = [k for k, at in enumerate(there) if at is not None]
+    at = [k for k in there if k is not None]
+
+    def picked_both(values: np.ndarray, default: float) -> np.ndarray:
+        found = default * np.eye(len(free))
+        found[np.ix_(inside, inside)] = values[np.ix_(at, at)]
+        return found
+
+    return Trial(
+        trial.terms,
+        optimum._replace(
+            z=z, free=free, gradient=picked(optimum.gradient, [0.0] * len(free)), centre=picked(optimum.centre, z[list(free)]),
+            fisher=picked_both(optimum.fisher, 1.0), covariance=picked_both(optimum.covariance, 1.0),
+        ),
+    )  # fmt: skip
+
+
+def _as_certain(here: Optimum, said: Optimum) -> Optimum:
+    """Return an optimum whose parameters are as certain as the simulations say."""
+    return here._replace(centre=said.centre, covariance=said.covariance, converged=True)
