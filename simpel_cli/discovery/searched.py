@@ -21,6 +21,7 @@ from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.simulations import in_rows, simulating
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
@@ -30,6 +31,7 @@ from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, cali
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
+from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows, thinned
 from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, test_windows
@@ -295,20 +297,37 @@ def _with(
     terms = terms_of(model, ground.clean.recording, effects, pairs=options.pairs)
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
 
-    def wider(found: Calibrated, trial: Trial) -> Wider | None:
-        return too_narrow(found.search, trial) if ground.wider < MOST_WIDER else None
+    def wider(search: Search, trial: Trial) -> Wider | None:
+        return too_narrow(search, trial) if ground.wider < MOST_WIDER else None
+
+    def fitter(plan: Setup) -> Fitter:
+        return fitter_of(plan, options.lanes, options.room + members(plan))
 
     def begun_in(plan: Setup) -> tuple[Assessor, Calibrated]:
-        fitter = fitter_of(plan, options.lanes, options.room + members(plan))
         assessor = Assessor(plan, options.horizon)
-        found = calibrated(plan, fitter, assessor, ground.clean, terminal)
+        found = calibrated(plan, fitter(plan), assessor, ground.clean, terminal)
         found.search.budget = ground.budget
         return assessor, found
 
+    def chosen_in(found: Calibrated, assessor: Assessor) -> tuple[Selection, list[Gate]] | Wider:
+        """Choose effects by what the model will be used for; ranges that turn out to be too narrow end it."""
+        search, base, simulated = found.search, found.base, options.for_ == FREE_RUN
+        if simulated:
+            own = saying(model, between_rows)
+            search = simulating(search, base, partial(attach, own, kept=kept, simulated=True), fitter)
+            base, assessor = search.base(), Assessor(search.plan, options.horizon)
+        if (ends := wider(search, base)) is not None:
+            return ends
+        selection, gates = accepted(search, assessor, base, options, terminal)
+        if (ends := wider(search, selection.chosen)) is not None:
+            return ends
+        return (in_rows(search, selection, found.search) if simulated else selection), gates
+
     assessor, found = begun_in(plan)
-    if (ends := wider(found, found.base)) is not None:
-        return ends
-    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    picked = chosen_in(found, assessor)
+    if isinstance(picked, Wider):
+        return picked
+    selection, gates = picked
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
@@ -316,9 +335,10 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
         assessor, found = begun_in(plan)
-        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
-    if (ends := wider(found, selection.chosen)) is not None:
-        return ends
+        picked = chosen_in(found, assessor)
+        if isinstance(picked, Wider):
+            return picked
+        selection, gates = picked
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
@@ -330,7 +350,10 @@ def _with(
     if heavy is not None:
         found = heavy
         found.search.budget = ground.budget
-        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+        picked = chosen_in(found, assessor)
+        if isinstance(picked, Wider):
+            return picked
+        selection, gates = picked
     search, windows = found.search, found.test
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")

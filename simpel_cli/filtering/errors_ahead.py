@@ -28,7 +28,7 @@ class Assessment(NamedTuple):
         one_step: (W, T, ny) measured minus predicted from all rows before.
         variance: (W, T, ny) that the model claims for it.
         ahead: (W, T, ny) the same from the state `horizon` rows before, without looking at rows in between.
-        free: (W, T, ny) the same from row SETTLE on without ever looking again.
+        free: (W, T, ny) the same from row SETTLE on without ever looking again, the simulation alone.
         log_likelihood: (W,) of the window's measurements.
         free_mean: (W, T, ny) the free run itself.
         track: of the filter.
@@ -219,10 +219,12 @@ def _window(
     reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
     ahead = jnp.concatenate([y[:horizon], reached])[:rows]
 
+    alone = jnp.ones(len(start)).at[jnp.array(rule.remainders, int)].set(0.0)
+
     def run(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], Array]:
         before, x = carry
         # up to SETTLE the filter's state, from there on the model alone
-        x = jnp.where(k <= SETTLE, track.mean[k], x)
+        x = jnp.where(k <= SETTLE, track.mean[k], x) * alone
         return (x, following(x, k)), read(before, x, jnp.maximum(k, 1))
 
     free = jax.lax.scan(run, (start, start), jnp.arange(rows))[1]

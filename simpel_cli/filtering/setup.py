@@ -10,6 +10,7 @@ from simpel_cli.errors import ConfigError, DataError
 from simpel_cli.filtering.likelihood.augmented import Augmented, augment
 from simpel_cli.filtering.likelihood.coordinates import Coordinates, coordinates_of
 from simpel_cli.filtering.likelihood.filter import filter_of
+from simpel_cli.filtering.likelihood.remainders import remainders_of
 from simpel_cli.filtering.likelihood.track import Filter
 from simpel_cli.filtering.measurements import windows as windows_
 from simpel_cli.filtering.measurements.integration_steps import substeps_needed
@@ -66,6 +67,7 @@ def setup(
     kept: Collection[Key] | None = None,
     extra: Sequence[Term] = (),
     most_rows: int | None = None,
+    simulated: bool = False,
 ) -> Setup:
     """Attach every effect, cut the training episodes into windows and bind the filter.
 
@@ -79,6 +81,8 @@ def setup(
         kept: terms to attach; None: all.
         extra: terms to attach beside them.
         most_rows: of the windows, about; None: all.
+        simulated: every episode is one simulation; what it leaves is no noise of the process but has a memory of its own in
+            every channel (see `remainders`).
 
     Raises:
         DataError: too few rows.
@@ -99,7 +103,11 @@ def setup(
     added = {key_of(t) for t in extra}
     terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)]
     terms += extra
-    augmented = augment(model, terms, measured)
+    given = model
+    if simulated:
+        remainders = remainders_of(model, measured, recording.train, recording.outputs, scales)
+        model, scales = remainders.model, remainders.scales
+    augmented = augment(model, terms, measured, remainders.states if simulated else None)
     # of all of them, so that windows do not depend on what is kept
     longest = max((k.high for t in every if t.kind in (DELAY, LAG) for k in t.parameters), default=0.0)
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
@@ -120,10 +128,9 @@ def setup(
     noise_std = {name: max(known[name], 1e-9 * scales.size[name]) for name in measured}
     r = np.array(list(noise_std.values()))
     if substeps is None:
-        substeps = substeps_needed(model, recording.train, noise_std, scales, augmented.neutral[: len(model.params)])
+        substeps = substeps_needed(given, recording.train, noise_std, scales, augmented.neutral[: len(given.params)])
     rule = filter_of(augmented, substeps=substeps, lead=lead)
-    driven = [q.name for q in model.states if q.name in augmented.roles.dynamic]
-    typical = np.array([scales.rate[name] * np.sqrt(model.dt) for name in driven])
+    typical = np.array([scales.rate[model.states[i].name] * np.sqrt(model.dt) for i in augmented.driven])
     coordinates = coordinates_of(
         augmented,
         r,

@@ -196,8 +196,8 @@ def test_what_a_transition_cannot_hold_is_left_out_with_its_reason(monkeypatch: 
     assert "sensors" not in corrected
     assert [text.split(" (")[0] for text in left_out] == [
         "sensor_saturation on phi",
-        "crooked on phi",
         "actuator_rate_limit on u",
+        "crooked on phi",
         "input_backlash on u",
     ]
     assert all(len(text.split(" (")[1]) > 30 for text in left_out)

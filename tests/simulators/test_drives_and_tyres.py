@@ -152,16 +152,22 @@ def test_a_term_on_two_inputs_reads_both_as_they_were_given_in_an_extended_simul
 def test_an_overflow_reaches_the_other_tank_in_part() -> None:
     terms = {t.acts_on: t for t in attached("overflow_into", TANKS)}
     assert set(terms) == {"h, k", "k, h"}
-    spill, share = 0.7 * (0.9 - 0.6), 0.4
+    spill, share, sharp = 0.7 * (0.9 - 0.6), 0.4, 1e-9
     np.testing.assert_allclose(
-        push(TANKS, terms["h, k"], [0.9, 0.2], [0.0], [0.7, 0.6, share]), [-spill, share * spill]
+        push(TANKS, terms["h, k"], [0.9, 0.2], [0.0], [0.7, 0.6, sharp, share]), [-spill, share * spill]
     )
-    np.testing.assert_allclose(push(TANKS, terms["h, k"], [0.5, 0.9], [0.0], [0.7, 0.6, share]), [0, 0], atol=1e-15)
-    np.testing.assert_allclose(push(TANKS, terms["k, h"], [0.5, 0.9], [0.0], [0.7, 0.6, 1.0]), [spill, -spill])
+    np.testing.assert_allclose(
+        push(TANKS, terms["h, k"], [0.5, 0.9], [0.0], [0.7, 0.6, sharp, share]), [0, 0], atol=1e-12
+    )
+    np.testing.assert_allclose(push(TANKS, terms["k, h"], [0.5, 0.9], [0.0], [0.7, 0.6, sharp, 1.0]), [spill, -spill])
     (own,) = [t for t in catalogue("overflow").attach(TANKS, unit_scales(TANKS), ()) if t.acts_on == "h"]
     np.testing.assert_allclose(
-        push(TANKS, terms["h, k"], [0.9, 0.2], [0.0], [0.7, 0.6, 0.0]), push(TANKS, own, [0.9, 0.2], [0.0], [0.7, 0.6])
+        push(TANKS, terms["h, k"], [0.9, 0.2], [0.0], [0.7, 0.6, sharp, 0.0]),
+        push(TANKS, own, [0.9, 0.2], [0.0], [0.7, 0.6, sharp]),
     )
+    at_the_edge, far_below = (push(TANKS, own, [level, 0.2], [0.0], [0.7, 0.6, 0.1])[0] for level in (0.6, -2.0))
+    assert at_the_edge == pytest.approx(-0.7 * 0.1 / 2)
+    assert -1e-3 < far_below < 0
     assert [t.acts_on for t in attached("overflow_into", ROOM)] == ["T, floor", "floor, T"]
     with pytest.raises(ModelError, match=r"effect.e.passes: goes with a `term` of `x` alone"):
         Expression("e", "", "first_order", "k*(other - x)", passes="0.5", parameters={"k": {"range": [0, 1]}})

@@ -6,7 +6,7 @@ evidence and gates. What was found is then said in the coordinates of the ordina
 once more: residuals, errors ahead and what is left are looked at there.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def _moved(simulated: Search, trial: Trial, search: Search) -> Trial:
     n_p, n_r, _ = search.plan.coordinates.sizes
     z[n_p + n_r : -1] = search.plan.start[n_p + n_r : len(z) - 1]
 
-    def picked(values: np.ndarray, default: Sequence[float]) -> np.ndarray:
+    def picked(values: np.ndarray, default: np.ndarray) -> np.ndarray:
         return np.array([d if k is None else values[k] for k, d in zip(there, default, strict=True)])
 
     inside = [k for k, at in enumerate(there) if at is not None]
@@ -101,13 +101,15 @@ def _moved(simulated: Search, trial: Trial, search: Search) -> Trial:
         found[np.ix_(inside, inside)] = values[np.ix_(at, at)]
         return found
 
-    return Trial(
-        trial.terms,
-        optimum._replace(
-            z=z, free=free, gradient=picked(optimum.gradient, [0.0] * len(free)), centre=picked(optimum.centre, z[list(free)]),
-            fisher=picked_both(optimum.fisher, 1.0), covariance=picked_both(optimum.covariance, 1.0),
-        ),
-    )  # fmt: skip
+    moved = optimum._replace(
+        z=z,
+        free=free,
+        gradient=picked(optimum.gradient, np.zeros(len(free))),
+        centre=picked(optimum.centre, z[list(free)]),
+        fisher=picked_both(optimum.fisher, 1.0),
+        covariance=picked_both(optimum.covariance, 1.0),
+    )
+    return Trial(trial.terms, moved)
 
 
 def _as_certain(here: Optimum, said: Optimum) -> Optimum:

@@ -4,7 +4,7 @@ A compile takes seconds and there are dozens of candidates: so one program is co
 by which parameters it moves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import casadi
@@ -32,6 +32,7 @@ class Augmented(NamedTuple):
         own_lag: (nu) known lags, s.
         own_late: (ny) known delays of the sensors, s, and (ny) known lags.
         roles: of the states.
+        remainders: states that are added to what sensors read; where there are some, process noise acts on them alone.
     """
 
     model: Model
@@ -45,6 +46,13 @@ class Augmented(NamedTuple):
     own_lag: tuple[float, ...]
     own_late: tuple[tuple[float, ...], tuple[float, ...]]
     roles: Structure
+    remainders: tuple[str, ...] = ()
+
+    @property
+    def driven(self) -> tuple[int, ...]:
+        """Rows of the state that process noise acts on."""
+        names = self.remainders or self.roles.dynamic
+        return tuple(i for i, q in enumerate(self.model.states) if q.name in names)
 
     def rows(self, term: Term) -> list[int]:
         """Rows of p that belong to a term."""
@@ -57,8 +65,18 @@ class Augmented(NamedTuple):
         return {names.index(g.spread.name): [names.index(q.name) for q in g.members] for g in term.groupings}
 
 
-def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Augmented:
-    """Attach every term to the model."""
+def augment(
+    model: Model, terms: Sequence[Term], measured: Sequence[str], remainders: Mapping[str, str] | None = None
+) -> Augmented:
+    """Attach every term to the model.
+
+    Args:
+        model: the simulator.
+        terms: candidates.
+        measured: names of the measured states and outputs.
+        remainders: measured channel -> state that is added to what its sensor reads (see `remainders`).
+    """
+    remainders = remainders or {}
     params = [*model.params]
     neutral = [centre(q) for q in model.params]
     for term in terms:
@@ -107,7 +125,7 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
         for term in terms:
             if term.kind == SENSOR and term.acts_on == name:
                 value = parse(term.expression, names | {name: value}, model.symbol)
-        channels.append(value)
+        channels.append(value + names[remainders[name]] if name in remainders else value)
     function = casadi.Function(
         f"{model.name}_augmented",
         [x, u, p],
@@ -135,7 +153,7 @@ def augment(model: Model, terms: Sequence[Term], measured: Sequence[str]) -> Aug
         constant[kind] = tuple(0.0 if v in columns else float(model.fixed.get(str(v), v)) for v in each)
     return Augmented(
         model, tuple(terms), tuple(measured), function, tuple(params), np.array(neutral), operators, constant[DELAY],
-        constant[LAG], (constant[SENSOR_DELAY], constant[SENSOR_LAG]), structure(model),
+        constant[LAG], (constant[SENSOR_DELAY], constant[SENSOR_LAG]), structure(model), tuple(remainders.values()),
     )  # fmt: skip
 
 

@@ -120,7 +120,8 @@ def coordinates_of(
         rows.append((np.log(low), np.log(high), True, bool(known)))
     rows += [(np.log(low), np.log(high), True, False) for low, high in zip(q_low, q_high, strict=True)]
     rows.append((0.0, 1.0, False, False))  # padding
-    states = [q.name for q in augmented.model.states]
-    driven = tuple(states.index(name) for name in states if name in augmented.roles.dynamic)
+    driven = augmented.driven
     low, high, log, normal = (np.array(column) for column in zip(*rows, strict=True))
-    return Coordinates(low, high, log, normal, (len(augmented.params), len(r), len(driven)), driven, len(states))
+    return Coordinates(
+        low, high, log, normal, (len(augmented.params), len(r), len(driven)), driven, len(augmented.model.states)
+    )

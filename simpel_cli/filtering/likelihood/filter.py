@@ -57,11 +57,12 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     key = (
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
         augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag,
-        augmented.own_late, model.linear, substeps, lead,
+        augmented.own_late, model.linear, augmented.remainders, substeps, lead,
     )  # fmt: skip
     if key not in _KEPT:
         name = hashlib.sha256(repr(key).encode()).hexdigest()
-        _KEPT[key] = _filter_of(augmented, substeps, lead)._replace(name=name)
+        remainders = augmented.driven if augmented.remainders else ()
+        _KEPT[key] = _filter_of(augmented, substeps, lead)._replace(name=name, remainders=remainders)
         while len(_KEPT) > MOST_KEPT:
             _KEPT.popitem(last=False)
     _KEPT.move_to_end(key)

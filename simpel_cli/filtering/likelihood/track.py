@@ -91,6 +91,7 @@ class Filter(NamedTuple):
             value may have been measured before it.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
             and end; what stands behind the inputs, behind them.
+        remainders: rows of the state that are no part of a simulation (see `remainders.py`).
     """
 
     name: str
@@ -101,3 +102,4 @@ class Filter(NamedTuple):
     measure: Callable[..., Float[Array, " ny"]]
     read: Callable[..., Float[Array, " ny"]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
+    remainders: tuple[int, ...] = ()

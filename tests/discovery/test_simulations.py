@@ -1,0 +1,67 @@
+"""A search by simulations: what it finds, and how that is said in the coordinates of the ordinary search."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_ranges import DRAG, cart, measured, searched
+
+from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.simulations import in_rows, simulating
+from simpel_cli.discovery.search.smaller import names_of
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import Setup, setup
+
+B, K = 1.2, 0.15
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[Any, ...]:
+    recording = measured(B, k=K)
+    search = searched(recording)
+    base = search.base()
+    simulated = simulating(
+        search, base, lambda: setup(cart(), recording, (), [DRAG], 1, simulated=True),
+        lambda plan: Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15),
+    )  # fmt: skip
+    selection = select(simulated, simulated.base())
+    return search, simulated, selection, in_rows(simulated, selection, search)
+
+
+def value(plan: Setup, trial: Any, name: str) -> float:
+    row = names_of(plan).index(name)
+    return plan.coordinates.value(row, float(trial.optimum.z[row]))
+
+
+def test_the_effect_is_found_by_simulations(both: tuple[Any, ...]) -> None:
+    _, simulated, selection, _ = both
+    assert [simulated.terms[t].effect for t in selection.chosen.terms] == ["drag"]
+    assert value(simulated.plan, selection.chosen, "b") == pytest.approx(B, rel=2e-3)
+    assert value(simulated.plan, selection.chosen, "drag_v_k") == pytest.approx(K, rel=2e-2)
+    # what the simulator alone leaves is no noise of the process, and the effect takes it away
+    before, after = (
+        value(simulated.plan, t, "process noise of remainder_s") for t in (selection.base, selection.chosen)
+    )
+    assert after < 0.2 * before
+
+
+def test_it_is_said_in_the_coordinates_of_the_ordinary_search(both: tuple[Any, ...]) -> None:
+    search, simulated, selection, found = both
+    for own, there in ((found.base, selection.base), (found.chosen, selection.chosen)):
+        assert own.terms == there.terms
+        assert own.optimum.free == search.free(own.terms)
+        for name in ("b", "drag_v_k")[: 1 + len(own.terms)]:
+            assert value(search.plan, own, name) == pytest.approx(value(simulated.plan, there, name))
+            row, far = (names_of(s.plan).index(name) for s in (search, simulated))
+            i, k = own.optimum.free.index(row), there.optimum.free.index(far)
+            assert own.optimum.covariance[i, i] == there.optimum.covariance[k, k]
+    assert found.gains == selection.gains
+    assert search.part(found.chosen, ()).optimum is found.base.optimum
+    # levels of noise are those of the ordinary search at these parameters: the right model needs none of the process
+    plan = search.plan
+    n_p, n_r, n_q = plan.coordinates.sizes
+    q = [plan.coordinates.value(i, float(found.chosen.optimum.z[i])) for i in range(n_p + n_r, n_p + n_r + n_q)]
+    p = [plan.coordinates.value(i, float(found.base.optimum.z[i])) for i in range(n_p + n_r, n_p + n_r + n_q)]
+    assert q[-1] < 0.2 * p[-1]
+    assert np.isfinite(found.chosen.optimum.log_evidence)
+    assert all(t.optimum.free == search.free(t.terms) for s in found.stages for t in (s.before, *s.trials))
