@@ -21,7 +21,7 @@ from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.simulations import in_rows, simulating
+from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
@@ -309,25 +309,10 @@ def _with(
         found.search.budget = ground.budget
         return assessor, found
 
-    def chosen_in(found: Calibrated, assessor: Assessor) -> tuple[Selection, list[Gate]] | Wider:
-        """Choose effects by what the model will be used for; ranges that turn out to be too narrow end it."""
-        search, base, simulated = found.search, found.base, options.for_ == FREE_RUN
-        if simulated:
-            own = saying(model, between_rows)
-            search = simulating(search, base, partial(attach, own, kept=kept, simulated=True), fitter)
-            base, assessor = search.base(), Assessor(search.plan, options.horizon)
-        if (ends := wider(search, base)) is not None:
-            return ends
-        selection, gates = accepted(search, assessor, base, options, terminal)
-        if (ends := wider(search, selection.chosen)) is not None:
-            return ends
-        return (in_rows(search, selection, found.search) if simulated else selection), gates
-
     assessor, found = begun_in(plan)
-    picked = chosen_in(found, assessor)
-    if isinstance(picked, Wider):
-        return picked
-    selection, gates = picked
+    if (ends := wider(found.search, found.base)) is not None:
+        return ends
+    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
@@ -335,10 +320,9 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
         assessor, found = begun_in(plan)
-        picked = chosen_in(found, assessor)
-        if isinstance(picked, Wider):
-            return picked
-        selection, gates = picked
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    if (ends := wider(found.search, selection.chosen)) is not None:
+        return ends
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
@@ -350,11 +334,17 @@ def _with(
     if heavy is not None:
         found = heavy
         found.search.budget = ground.budget
-        picked = chosen_in(found, assessor)
-        if isinstance(picked, Wider):
-            return picked
-        selection, gates = picked
+        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     search, windows = found.search, found.test
+    if options.for_ == FREE_RUN and not ground.budget.over("a search by simulations"):
+        attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
+        simulated = simulating(search, selection.base, attach_simulated, fitter)
+        ahead = Assessor(simulated.plan, options.horizon)
+        by_simulations = chosen_by_simulations(search, selection, simulated, ahead, options, terminal)
+        if by_simulations is not None:
+            if (ends := wider(simulated, by_simulations[0].chosen)) is not None:
+                return ends
+            selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)

@@ -173,3 +173,18 @@ def test_the_corrected_simulator_says_the_wider_range() -> None:
     based = written({"base": sim, "parameters": {}}, ranges_of([out]))
     assert based["base"]["parameters"]["b"]["range"] == [low, high]
     assert sim["parameters"]["b"] == {"unit": "A", "range": [0.8, 1.8]}
+
+
+def test_an_effect_that_only_makes_up_for_a_range_gives_way_to_a_wider_one() -> None:
+    boost = Expression(
+        "boost", acts_on="v", term="k*rate", parameters={"k": {"range": [0, 1.5], "unit": "1", "starts": [0.3]}}
+    )
+    search = searched(measured(2.4), [boost])
+    base = search.base()
+    (with_it,) = [t for t in search.add(base, search.candidates(())).trials if not search.terms[t.terms[-1]].depends_on]
+    assert with_it.optimum.log_evidence > base.optimum.log_evidence + 50
+    found = too_narrow(search, with_it)
+    assert found is not None
+    assert list(found.ranges) == ["b"]
+    right = searched(measured(1.2, k=0.15))
+    assert too_narrow(right, right.add(right.base(), [0]).trials[0]) is None

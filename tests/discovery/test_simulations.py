@@ -7,10 +7,13 @@ import pytest
 from test_ranges import DRAG, cart, measured, searched
 
 from simpel_cli.discovery.search.selection import select
-from simpel_cli.discovery.search.simulations import in_rows, simulating
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
 from simpel_cli.discovery.search.smaller import names_of
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, setup
+from simpel_cli.runs.console import Terminal
 
 B, K = 1.2, 0.15
 
@@ -65,3 +68,23 @@ def test_it_is_said_in_the_coordinates_of_the_ordinary_search(both: tuple[Any, .
     assert q[-1] < 0.2 * p[-1]
     assert np.isfinite(found.chosen.optimum.log_evidence)
     assert all(t.optimum.free == search.free(t.terms) for s in found.stages for t in (s.before, *s.trials))
+
+
+def test_what_simulations_ask_for_is_chosen_where_it_is_worth_more() -> None:
+    recording = measured(B, k=K)
+    search = searched(recording)
+    base = search.base()
+    simulated = simulating(
+        search, base, lambda: setup(cart(), recording, (), [DRAG], 1, simulated=True),
+        lambda plan: Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15),
+    )  # fmt: skip
+    assessor, terminal = Assessor(simulated.plan, 10), Terminal(quiet=True)
+    found = select(search, base)
+    assert [search.terms[t].effect for t in found.chosen.terms] == ["drag"]
+    options = Discovery(beginnings=0)
+    assert chosen_by_simulations(search, found, simulated, assessor, options, terminal) is None  # they say the same
+    nothing = found._replace(chosen=found.base, path=(found.base,), classes=(), gains=())
+    other = chosen_by_simulations(search, nothing, simulated, assessor, options, terminal)
+    assert other is not None
+    assert [simulated.terms[t].effect for t in other[0].chosen.terms] == ["drag"]
+    assert all(g.passed for g in other[1])

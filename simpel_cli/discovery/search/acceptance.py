@@ -19,10 +19,15 @@ MOST_SEARCHES = 3  # each goes on without the effects that did harm in those bef
 
 
 def accepted(
-    search: Search, assessor: Assessor, base: Trial, options: Discovery, terminal: Terminal
+    search: Search,
+    assessor: Assessor,
+    base: Trial,
+    options: Discovery,
+    terminal: Terminal,
+    begun: tuple[Trial, ...] = (),
 ) -> tuple[Selection, list[Gate]]:
-    """Search, and go on without an effect that does harm: another one may be what it stood for."""
-    selection = select(search, base, options.beginnings)
+    """Search, and go on without an effect that does harm: another one may be what it stood for; begun: as of `select`."""
+    selection = select(search, base, options.beginnings, begun)
     for attempt in range(MOST_SEARCHES):
         selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
         last = attempt == MOST_SEARCHES - 1 or (

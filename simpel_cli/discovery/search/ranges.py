@@ -22,6 +22,7 @@ from simulators.model import Model
 AT_END = 0.005  # of a range: a fit that ends so near to an end of it
 TIMES = 2.0  # spans by which a range becomes wider at that end
 NEAREST = 0.1  # of a bound that is not zero: as near to zero as a wider range comes
+NEARLY_ALL = 0.8  # of what the best effect gains (0.83 on the heaters of TCLab, where it is the range)
 MOST_WIDER = 3  # times that ranges become wider
 
 Range = tuple[float, float]
@@ -42,19 +43,32 @@ class Wider(NamedTuple):
 def too_narrow(search: Search, trial: Trial) -> Wider | None:
     """Return the wider ranges with which a model gains; None: there are none.
 
-    The simulator alone has to gain with them what it gains with the best effect: that one may only make up for them, and that
-    a range is too narrow is the simpler cause.
+    The simulator alone has to gain with them nearly what it gains with the best effect, or the rest of a model what an effect
+    adds to it: that may only make up for them, and that a range is too narrow is the simpler cause.
     """
+    if not trial.terms:
+        wider = _wider(search.plan, trial)
+        trials = search.add(trial, search.candidates(())).trials if wider else ()
+        best = trials[0].optimum.log_evidence - trial.optimum.log_evidence if trials else 0.0
+        return _paying(search, trial, NEARLY_ALL * best - TIE)
+    found = _paying(search, trial, 0.0)
+    for gone in trial.terms if found is None else ():
+        rest = search.part(trial, tuple(t for t in trial.terms if t != gone))
+        earned = trial.optimum.log_evidence - rest.optimum.log_evidence
+        found = found or _paying(search, rest, NEARLY_ALL * earned - TIE)
+    return found
+
+
+def _paying(search: Search, trial: Trial, least: float) -> Wider | None:
+    """Return the wider ranges with which a model gains so many nats, and what they have to earn; None: it does not."""
     wider = _wider(search.plan, trial)
     if not wider:
         return None
     gain = _best(search, trial, wider) - trial.optimum.log_evidence
-    least = ACCEPT * len(wider)
-    if gain > least and not trial.terms:
-        trials = search.add(trial, search.candidates(())).trials
-        least = max([least, *(t.optimum.log_evidence - trial.optimum.log_evidence - TIE for t in trials[:1])])
     names = [q.name for q in search.plan.augmented.params]
-    return Wider({names[row]: ends for row, ends in wider.items()}, float(gain)) if gain > least else None
+    if not gain > max(least, ACCEPT * len(wider)):
+        return None
+    return Wider({names[row]: ends for row, ends in wider.items()}, float(gain))
 
 
 def widened(model: Model, effects: Sequence[Expression], ranges: Mapping[str, Range]) -> tuple[Model, list[Expression]]:

@@ -54,19 +54,25 @@ class _Grown(NamedTuple):
     remainder: tuple[Term, float] | None
 
 
-def select(search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS) -> Selection:
+def select(
+    search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS, begun: tuple[Trial, ...] = ()
+) -> Selection:
     """Search, from the calibrated simulator if it is known already.
 
     Args:
         search: over the sets of effects of one setup.
         base: its calibrated simulator.
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
+        begun: fits from the calibrated simulator to a set of effects that the search begins with, too.
     """
     base = base or search.base()
     grown = _grow(search, (base,))
+    if len(begun) > 1:
+        search.report(f"beginning with {' and '.join(search.terms[t].label for t in begun[-1].terms)}")
+        grown = max(grown, _grow(search, begun), key=lambda g: worth(g.path[-1]))
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
-        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: _worth(g.path[-1]))
+        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
     return _settled(search, grown)
 
 
@@ -115,7 +121,7 @@ def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, 
         grown = again._replace(stages=(*(grown.stages if chosen.terms else ()), *again.stages))
 
 
-def _worth(trial: Trial) -> float:
+def worth(trial: Trial) -> float:
     """Return the evidence of a model less what its effects have to earn, nats."""
     return trial.optimum.log_evidence - sum(asked(k + 1) for k in range(len(trial.terms)))
 
@@ -202,7 +208,7 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
     An input that arrives late makes two sensors seem late, and one function of the input two faults of it. None: there is
     no such term.
     """
-    most, found = _worth(chosen), None
+    most, found = worth(chosen), None
     pairs = list(combinations(chosen.terms, 2))
     if pairs and search.budget.over("one effect in place of two"):
         return None
@@ -225,10 +231,10 @@ def _merged(search: Search, chosen: Trial) -> Stage | None:
         trials = sorted((search.best(t.terms, ()) for t in stage.trials), key=lambda t: -t.optimum.log_evidence)
         stage, named = stage._replace(trials=tuple(trials)), search.best_named(trials)
         for trial in [*([named] if named else []), *(t for t in trials[:1] if _nameless(search, t))]:
-            worth = _worth(trial) - (ACCEPT if _nameless(search, trial) else 0.0)
-            if worth > most:
+            value = worth(trial) - (ACCEPT if _nameless(search, trial) else 0.0)
+            if value > most:
                 others = [t for t in stage.trials if t is not trial]
-                most, found = worth, stage._replace(trials=(trial, *others))
+                most, found = value, stage._replace(trials=(trial, *others))
     return found
 
 

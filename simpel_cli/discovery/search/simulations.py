@@ -10,11 +10,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.acceptance import accepted
+from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.selection import Selection, worth
+from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, names_of
-from simpel_cli.discovery.search.trials import Search, Stage, Trial
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
+from simpel_cli.runs.console import Terminal
 
 
 def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter: Callable[[Setup], Fitter]) -> Search:
@@ -45,6 +50,35 @@ def _begun(old: Setup, z: np.ndarray, plan: Setup) -> np.ndarray:
     n_p = plan.coordinates.sizes[0]
     start[n_p:] = plan.start[n_p:]
     return start
+
+
+def chosen_by_simulations(
+    found: Search, selection: Selection, simulated: Search, assessor: Assessor, options: Discovery, terminal: Terminal
+) -> tuple[Selection, list[Gate]] | None:
+    """Return other effects that simulations ask for, with their gates; None: they ask for none that are worth more.
+
+    Args:
+        found: the ordinary search.
+        selection: what it has chosen: the search by simulations begins with that, too.
+        simulated: the search by simulations.
+        assessor: of its program.
+        options: of the search.
+        terminal: takes lines.
+    """
+    terminal.line("by simulations, whose remainders have a memory", "search")
+    path = [simulated.base()]
+    for trial in selection.path[1:]:
+        start = Hypothesis(
+            _begun(found.plan, trial.optimum.z, simulated.plan), simulated.free(trial.terms), simulated.ones
+        )
+        path.append(simulated.best(trial.terms, simulated.fitter([start])))
+    own = path[-1]
+    other, gates = accepted(simulated, assessor, path[0], options, terminal, tuple(path))
+    better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
+    if not other.chosen.terms or not better:
+        terminal.line("they ask for nothing else", "search")
+        return None
+    return other, gates
 
 
 def in_rows(simulated: Search, selection: Selection, search: Search) -> Selection:
