@@ -270,14 +270,19 @@ class Declared:
         lags = {name: sensor.lag for name, sensor in sensors.items() if sensor.lag is not None}
 
         def named(p: Symbol) -> dict[str, Symbol]:
+            """Without what depends on a covariate, which is an input."""
             scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
-            return evaluated(derived, scope | {quantity.name: p[row] for row, quantity in enumerate(params)})
+            scope |= {quantity.name: p[row] for row, quantity in enumerate(params)}
+            for name, definition in derived.items():
+                if definition.uses <= scope.keys():
+                    scope[name] = definition.build(scope)
+            return scope
 
         def known(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
-            scope = named(p)
-            for group, column in ((states, x), (inputs, u)):
+            scope: dict[str, Symbol] = {name: self.symbol(value) for name, value in fixed.items()}
+            for group, column in ((states, x), (inputs, u), (params, p)):
                 scope |= {quantity.name: column[row] for row, quantity in enumerate(group)}
-            return scope
+            return evaluated(derived, scope)
 
         def whole(x: Symbol, u: Symbol, p: Symbol) -> dict[str, Symbol]:
             return evaluated(defined, known(x, u, p))

@@ -336,7 +336,7 @@ def _with(
         found.search.budget = ground.budget
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     search, windows = found.search, found.test
-    if options.for_ == FREE_RUN and not ground.budget.over("a search by simulations"):
+    if options.simulations and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
         ahead = Assessor(simulated.plan, options.horizon)

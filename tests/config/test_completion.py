@@ -23,7 +23,7 @@ from simpel_cli.config.groups import options
         ("fit", "method.steps", ["method=fsvgd"], ["method.steps=5000"]),
         ("fit", "method.sysid.sta", ["method=gp"], ["method.sysid.starts=8"]),
         ("fit", "run.figures=", [], ["run.figures=true", "run.figures=false"]),
-        ("discover", "effect=[leak,overf", [], ["effect=[leak,overflow"]),
+        ("discover", "effect=[leak,overf", [], ["effect=[leak,overflow", "effect=[leak,overflow_into"]),
         ("rl-offline", "sim@truth=parking_c", [], ["sim@truth=parking_car"]),
         ("rl-online", "rewa", [], ["reward=parking", "reward=swing_up"]),
         ("evaluate", "meth", [], []),

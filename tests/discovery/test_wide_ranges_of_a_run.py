@@ -60,11 +60,12 @@ def searched(folder: Path, drift: float, *words: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("wide")
-    return folder, searched(folder, 0.0, "discovery.for=free_run")
+    return folder, searched(folder, 0.0, "discovery.for=free_run", "discovery.simulations=true")
 
 
 def test_nothing_makes_up_for_the_range(wide: tuple[Path, dict[str, Any]]) -> None:
-    _, found = wide
+    folder, found = wide
+    assert "they ask for nothing else" in (folder / "run" / "run.log").read_text()  # nor do simulations
     assert found["verdict"] == "none"
     assert found["effects"] == []
     (outside,) = found["outside_ranges"]

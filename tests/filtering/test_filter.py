@@ -81,7 +81,7 @@ def test_the_likelihood_is_that_of_the_exact_gaussian(plan: Setup, missing: tupl
 def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: float) -> None:
     """Against exp(-d s)/(1 + tau s) on the exponential with which v settles, which has a closed form."""
     effects = [
-        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
         for kind in ("sensor_delay", "sensor_lag")
     ]
     plan = setup(model(), recording(), (), effects, 4)
@@ -105,7 +105,7 @@ def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: fl
 def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> None:
     late, lag = 0.06, 0.1
     effects = [
-        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
         for kind in ("sensor_delay", "sensor_lag")
     ]
     found = setup(model(), recording(), (), effects, 2)
@@ -113,7 +113,7 @@ def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> 
     p = p_of_plan(found, A, B)
     p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late, lag
     declared = replace(model(), sensor_delay={"v": late}, sensor_lag={"v": "tau"})
-    declared = replace(declared, params=(*declared.params, Quantity("tau", "s", 0, 1)))
+    declared = replace(declared, params=(*declared.params, Quantity("tau", "s", 0.0, 1.0)))
     own = setup(declared, recording(), (), effects, 2)
     assert [t.label for t in own.augmented.terms if t.kind in ("sensor_delay", "sensor_lag")] == []
     noise = Noise(jnp.full(2, 0.05), jnp.array([0.0, 0.3]))
@@ -128,7 +128,7 @@ def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> 
 def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float) -> None:
     """With a slow model, whose rates are those of the input: the reading is the input's integral, delayed and lagged."""
     effects = [
-        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0, 1], "unit": "s"}})
+        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
         for kind in ("sensor_delay", "sensor_lag")
     ]
     plan = setup(model(), recording(), (), effects, 2)

@@ -24,8 +24,10 @@ class Discovery:
             Without it, they are looked for in what is left at the end.
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
         for_: what the model is for: `free_run`, how many seconds ahead (0.5), or `one_step`. The last calibration, of the
-            simulator and of the corrected one, is for it. For `free_run` a second search takes every episode for one
-            simulation, whose remainder has a memory; what it finds is chosen where that is worth more. Null: one_step.
+            simulator and of the corrected one, is for it; null: one_step.
+        simulations: whether a second search takes every episode for one simulation, whose remainder has a memory; what it
+            finds is chosen where it is worth more. It takes as long again, and may take what differs from group to group for
+            effects.
         budget: how long the search may take, s (60, `60s`, `2min`): what is worth most comes first, and the verdict says what
             was left out. What has begun is ended, and the report comes on top. Null: as long as it takes.
     """
@@ -38,6 +40,7 @@ class Discovery:
     pairs: bool = False
     beginnings: int = BEGINNINGS
     for_: str | float | None = None
+    simulations: bool = False
     budget: str | float | None = None
 
     def __post_init__(self) -> None:
