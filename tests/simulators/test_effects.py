@@ -16,6 +16,7 @@ from simulators.effects.term import INPUT, OPERATORS, RATE, SENSOR
 from simulators.model import Declared, Model, ModelError
 
 LISTS = ("all", "vehicle")
+BY_NAME = ("voltage_sag",)  # tried where it is named
 LIMITS = ("input_saturation", "pacejka_tyre", "sensor_saturation", "traction_limit")
 NAMES = sorted(p.stem for p in (conf_dir() / "effect").glob("*.yaml") if p.stem not in LISTS)
 
@@ -134,7 +135,7 @@ def points(model: Model, seed: int = 0) -> list[tuple[list[float], list[float]]]
 def test_the_catalogue_is_that_of_the_plan() -> None:
     assert len(NAMES) >= 44
     listed = yaml.safe_load((conf_dir() / "effect" / "all.yaml").read_text())["defaults"]
-    assert sorted(listed) == NAMES
+    assert sorted([*listed, *BY_NAME]) == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -210,7 +210,9 @@ def _optimum(
     values = np.maximum(np.linalg.eigvalsh(fisher), LEAST_CURVATURE)
     at = z[list(free)]
     prior = np.where(uniform, LEAST_CURVATURE, 0.0)
-    covariance = np.linalg.inv(fisher + np.diag(prior))
+    # with both priors no eigenvalue is less, but for rounding beside very large ones
+    wide, axes = np.linalg.eigh(fisher + np.diag(prior))
+    covariance = (axes / np.maximum(wide, LEAST_CURVATURE)) @ axes.T
     centre = at - covariance @ (prior * (at - 0.5))
     bounded = np.sum((at < AT_BOUND) | (at > 1 - AT_BOUND))
     evidence = -loss + d / 2 * np.log(2 * np.pi) - 0.5 * np.log(values).sum() - np.log(2) * bounded
