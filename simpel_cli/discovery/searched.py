@@ -336,6 +336,7 @@ def _with(
         found.search.budget = ground.budget
         selection, gates = accepted(found.search, assessor, found.base, options, terminal)
     search, windows = found.search, found.test
+    by_simulations = None
     if options.simulations and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
@@ -352,7 +353,8 @@ def _with(
     if not ground.budget.over("functions of two arguments"):
         selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     alone = drifting(NoiseProfile(search, assessor, selection.base)) if selection.chosen.terms else None
-    if stands_for(alone, selection.base, selection.chosen):
+    # what simulations have chosen need not be worth anything one row ahead
+    if by_simulations is None and stands_for(alone, selection.base, selection.chosen):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
         selection, gates = cut(search, selection, [])._replace(remainder=None), []
         levels = NoiseProfile(search, assessor, selection.chosen)

@@ -9,11 +9,12 @@ from test_ranges import DRAG, cart, measured, searched
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
-from simpel_cli.discovery.search.smaller import names_of
+from simpel_cli.discovery.search.smaller import carried, names_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, setup
 from simpel_cli.runs.console import Terminal
+from simulators.effects import Expression
 
 B, K = 1.2, 0.15
 
@@ -88,3 +89,15 @@ def test_what_simulations_ask_for_is_chosen_where_it_is_worth_more() -> None:
     assert other is not None
     assert [simulated.terms[t].effect for t in other[0].chosen.terms] == ["drag"]
     assert all(g.passed for g in other[1])
+
+
+def test_what_is_switched_off_beyond_its_range_stays_so() -> None:
+    limit = Expression(
+        "limit", acts_on="u", term="min(max(u, -top), top)",
+        parameters={"top": {"range": [0.5, 3.0], "neutral": 6.0, "unit": "V"}},
+    )  # fmt: skip
+    recording = measured(B)
+    old, new = (setup(cart(), recording, (), [limit], 1, simulated=far) for far in (False, True))
+    row, there = (names_of(plan).index("limit_u_top") for plan in (old, new))
+    assert old.start[row] > 1
+    assert carried(old, old.start, new)[there] == new.start[there] == old.start[row]

@@ -87,7 +87,8 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
     Parameters are as the simulations say, and as certain; levels of noise are fitted anew; evidence of a set is that of the
     ordinary search there, gains are those of the simulations.
     """
-    sets = {frozenset(t.terms): t for t in (selection.base, selection.chosen, *selection.path)}
+    rivals = (t for rivals in selection.classes for t in rivals)
+    sets = {frozenset(t.terms): t for t in (*rivals, selection.base, selection.chosen, *selection.path)}
     moved = [_moved(simulated, t, search) for t in sets.values()]
     noise = search.fitter([Hypothesis(t.optimum.z, search.noise, search.ones) for t in moved])
     here = search.fitter(
@@ -98,13 +99,13 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
     search.banned = simulated.banned
     search.tried += simulated.tried
     for trial, optimum in zip(moved, here, strict=True):
-        search.known[frozenset(trial.terms)] = _as_certain(optimum, trial.optimum)
+        search.known[frozenset(trial.terms)] = _as_certain(search, optimum, trial.optimum)
     own = lambda t: Trial(t.terms, search.known[frozenset(t.terms)])  # noqa: E731
     return selection._replace(
         base=own(selection.base),
         chosen=own(selection.chosen),
         path=tuple(own(t) for t in selection.path),
-        classes=tuple(tuple(_moved(simulated, t, search) for t in rivals) for rivals in selection.classes),
+        classes=tuple(tuple(own(t) for t in rivals) for rivals in selection.classes),
         stages=tuple(
             Stage(
                 _moved(simulated, s.before, search), tuple(_moved(simulated, t, search) for t in s.trials), s.screened
@@ -146,6 +147,10 @@ def _moved(simulated: Search, trial: Trial, search: Search) -> Trial:
     return Trial(trial.terms, moved)
 
 
-def _as_certain(here: Optimum, said: Optimum) -> Optimum:
-    """Return an optimum whose parameters are as certain as the simulations say."""
-    return here._replace(centre=said.centre, covariance=said.covariance, converged=True)
+def _as_certain(search: Search, here: Optimum, said: Optimum) -> Optimum:
+    """Return an optimum whose parameters are as certain as the simulations say; of the noise the rows say it."""
+    own = np.array([i not in search.noise for i in here.free])
+    covariance = np.where(own[:, None] & own[None], said.covariance, 0.0)
+    covariance += np.where(own[:, None] | own[None], 0.0, here.covariance)
+    finite = bool(np.isfinite(here.loss))
+    return here._replace(centre=np.where(own, said.centre, here.centre), covariance=covariance, converged=finite)

@@ -29,8 +29,11 @@ def fitted_again(small: Search, search: Search, chosen: Trial) -> Trial:
 
 
 def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:
-    """Carry unit coordinates from one setup to another, by the names of parameters, channels and driven states."""
-    values = {name: old.coordinates.value(i, float(z[i])) for i, name in enumerate(names_of(old))}
+    """Carry unit coordinates from one setup to another, by the names of parameters, channels and driven states.
+
+    What is switched off by a neutral value beyond its range stays so.
+    """
+    values = {name: old.coordinates.value(i, float(z[i])) for i, name in enumerate(names_of(old)) if 0 <= z[i] <= 1}
     start = new.start.copy()
     for i, name in enumerate(names_of(new)):
         if name in values:

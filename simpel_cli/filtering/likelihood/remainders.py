@@ -89,6 +89,12 @@ def _rate(model: Model, name: str, episodes: Sequence[Episode], outputs: Sequenc
     columns = [
         e.states[:, states.index(name)] if name in states else e.outputs[:, list(outputs).index(name)] for e in episodes
     ]
-    steps = [np.diff(values[there]) / (np.diff(there) * model.dt)
-             for values in columns for there in [np.flatnonzero(np.isfinite(values))]]  # fmt: skip
-    return max(float(np.std(np.concatenate(steps))), 1e-12)
+    steps = [
+        (np.diff(values[there]), np.diff(there))
+        for values in columns
+        for there in [np.flatnonzero(np.isfinite(values))]
+    ]
+    rise, rows = (np.concatenate(part) for part in zip(*steps, strict=True))
+    if any(q.name == name and q.periodic for q in model.states):
+        rise = (rise + np.pi) % (2 * np.pi) - np.pi
+    return max(float(np.std(rise / (rows * model.dt))) if len(rise) else 0.0, 1e-12)
