@@ -10,6 +10,7 @@ from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
 from simpel_cli.discovery.search.smaller import carried, names_of
+from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, setup
@@ -19,15 +20,19 @@ from simulators.effects import Expression
 B, K = 1.2, 0.15
 
 
-@pytest.fixture(scope="module")
-def both() -> tuple[Any, ...]:
+def searches() -> tuple[Search, Search]:
+    """The ordinary search and the one by simulations."""
     recording = measured(B, k=K)
     search = searched(recording)
-    base = search.base()
-    simulated = simulating(
-        search, base, lambda: setup(cart(), recording, (), [DRAG], 1, simulated=True),
+    return search, simulating(
+        search, search.base(), lambda: setup(cart(), recording, (), [DRAG], 1, simulated=True),
         lambda plan: Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15),
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[Any, ...]:
+    search, simulated = searches()
     selection = select(simulated, simulated.base())
     return search, simulated, selection, in_rows(simulated, selection, search)
 
@@ -72,15 +77,9 @@ def test_it_is_said_in_the_coordinates_of_the_ordinary_search(both: tuple[Any, .
 
 
 def test_what_simulations_ask_for_is_chosen_where_it_is_worth_more() -> None:
-    recording = measured(B, k=K)
-    search = searched(recording)
-    base = search.base()
-    simulated = simulating(
-        search, base, lambda: setup(cart(), recording, (), [DRAG], 1, simulated=True),
-        lambda plan: Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15),
-    )  # fmt: skip
+    search, simulated = searches()
     assessor, terminal = Assessor(simulated.plan, 10), Terminal(quiet=True)
-    found = select(search, base)
+    found = select(search)
     assert [search.terms[t].effect for t in found.chosen.terms] == ["drag"]
     options = Discovery(beginnings=0)
     assert chosen_by_simulations(search, found, simulated, assessor, options, terminal) is None  # they say the same
@@ -89,6 +88,17 @@ def test_what_simulations_ask_for_is_chosen_where_it_is_worth_more() -> None:
     assert other is not None
     assert [simulated.terms[t].effect for t in other[0].chosen.terms] == ["drag"]
     assert all(g.passed for g in other[1])
+
+
+def test_a_search_begins_with_what_another_one_found(both: tuple[Any, ...]) -> None:
+    """The drag is no candidate, so that only the other search's set can bring it along."""
+    _, simulated, selection, _ = both
+    simulated.banned, before = set(range(len(simulated.terms))), simulated.banned
+    try:
+        assert select(simulated, selection.base, 0).chosen.terms == ()
+        assert select(simulated, selection.base, 0, selection.path).chosen.terms == selection.chosen.terms
+    finally:
+        simulated.banned = before
 
 
 def test_what_is_switched_off_beyond_its_range_stays_so() -> None:

@@ -51,12 +51,14 @@ def too_narrow(search: Search, trial: Trial) -> Wider | None:
         trials = search.add(trial, search.candidates(())).trials if wider else ()
         best = trials[0].optimum.log_evidence - trial.optimum.log_evidence if trials else 0.0
         return _paying(search, trial, NEARLY_ALL * best - TIE)
-    found = _paying(search, trial, 0.0)
-    for gone in trial.terms if found is None else ():
+    if (found := _paying(search, trial, 0.0)) is not None:
+        return found
+    for gone in trial.terms:
         rest = search.part(trial, tuple(t for t in trial.terms if t != gone))
         earned = trial.optimum.log_evidence - rest.optimum.log_evidence
-        found = found or _paying(search, rest, NEARLY_ALL * earned - TIE)
-    return found
+        if (found := _paying(search, rest, NEARLY_ALL * earned - TIE)) is not None:
+            return found
+    return None
 
 
 def _paying(search: Search, trial: Trial, least: float) -> Wider | None:

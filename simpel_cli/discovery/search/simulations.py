@@ -39,7 +39,7 @@ def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter:
     windows.start[:, :known], windows.spread[:, :known] = old.windows.start, old.windows.spread
     plan = plan._replace(windows=windows, spare=None)
     plan = plan._replace(optimum=_begun(old, base.optimum.z, plan))
-    search = Search(plan, fitter(plan).on(windows), found.report)
+    search = Search(plan, fitter(plan), found.report)
     search.budget, search.banned = found.budget, set(found.banned)
     return search
 
