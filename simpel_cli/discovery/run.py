@@ -13,10 +13,10 @@ from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentence_of
-from simpel_cli.discovery.search.grouping import sentence_of as of_grouping
+from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
+from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
-from simpel_cli.discovery.search.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.searched import Searched, latencies_of, search_of, with_latencies
 from simpel_cli.discovery.verdict.beyond import Beyond, beyond, ranges_of
 from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges

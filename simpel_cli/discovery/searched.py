@@ -10,13 +10,13 @@ from simpel_cli.data import Recording, read
 from simpel_cli.discovery.search.acceptance import accepted, with_interactions
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.budget import Budget, seconds_of
+from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
+from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
+from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
-from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, groupings
-from simpel_cli.discovery.search.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
-from simpel_cli.discovery.search.own_parameters import in_common, own_parameters, per_of, with_own
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.selection import Selection, cut

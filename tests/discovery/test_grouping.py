@@ -11,7 +11,7 @@ from command_line import simpel
 from test_effects_by_group import CART, DATA
 
 from simpel_cli.data import Measurements
-from simpel_cli.discovery.search.grouping import Grouping, confirmed, grouped_effects, sentence_of
+from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, sentence_of
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.errors import ConfigError

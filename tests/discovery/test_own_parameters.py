@@ -14,7 +14,7 @@ from command_line import simpel
 from test_effects_by_group import CART, DATA
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.own_parameters import _can_differ, with_own, written
+from simpel_cli.discovery.search.by_group.own_parameters import _can_differ, with_own, written
 from simpel_cli.discovery.search.smaller import small_search
 from simpel_cli.errors import ConfigError
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum

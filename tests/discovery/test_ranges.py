@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.own_parameters import written
+from simpel_cli.discovery.search.by_group.own_parameters import written
 from simpel_cli.discovery.search.ranges import in_words, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.selection import select
 from simpel_cli.discovery.search.trials import Search

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread
 from simpel_cli.discovery.search.score_test import Score, promises
-from simpel_cli.discovery.search.spreads import BEGIN, Spreading, respread
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.spreads import known
+from simpel_cli.discovery.search.by_group.spreads import known
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.groups import Grouping, grouping

@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from simpel_cli.discovery.search.grouping import Grouping, Question, judged
+from simpel_cli.discovery.search.by_group.grouping import Grouping, Question, judged
+from simpel_cli.discovery.search.by_group.spreads import respread
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, small_search
-from simpel_cli.discovery.search.spreads import respread
 from simpel_cli.discovery.search.trials import SPREADS, Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
