@@ -1,7 +1,7 @@
 """Covariance of a state from row to row, and what a row counts for; trailing axes are points."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
 
@@ -23,9 +23,10 @@ def of_row(half: Square, pace: Float[Array, "..."] | None) -> Square:
     return half if pace is None else half * pace[None, None]
 
 
-def after(cov: Square, jacobian: Square, half: Square) -> Square:
+def after(cov: Square, jacobian: Square, half: Square, sure: Bool[Array, ""]) -> Square:
     """Covariance at the next row."""
-    return product(apart(product(jacobian, cov + half)), jnp.swapaxes(jacobian, 0, 1)) + half
+    reached = apart(sure, product, jacobian, cov + half)
+    return product(reached, jnp.swapaxes(jacobian, 0, 1)) + half
 
 
 def counted(weight: Array) -> tuple[Array, Array]:

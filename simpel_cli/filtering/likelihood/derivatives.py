@@ -20,17 +20,10 @@ RATES, SENSORS = 0, 1  # results of a model's function
 
 
 class Slopes(NamedTuple):
-    """Derivatives of n results of a function at points, the trailing axes.
-
-    Args:
-        by_x: in the states.
-        by_u: in the inputs.
-        by_p: in the parameters, those that act on the same results in one table.
-    """
+    """Derivatives of n results of a function at points, the trailing axes: in the states and in the inputs."""
 
     by_x: Float[Array, "n nx ..."]
     by_u: Float[Array, "n nu ..."]
-    by_p: tuple[Float[Array, "rows columns ..."], ...]
 
 
 class Differentiated(NamedTuple):
@@ -38,12 +31,11 @@ class Differentiated(NamedTuple):
 
     Args:
         slopes: (x, u, p) -> Slopes, where x, u and p are (nx, ...), (nu, ...) and (dp, ...) at the same points.
-        along: (slopes, row) -> derivative in p[row], (n, ...); row: (...) at the last axes of the points, one beyond the last
-            row of p: 0.
+        along: (row, x, u, p) -> derivative in p[row], (n, ...); one beyond the last row of p: 0. p may lack axes of the points.
     """
 
     slopes: Callable[[Array, Array, Array], Slopes]
-    along: Callable[[Slopes, Int[Array, "..."]], Float[Array, "n ..."]]
+    along: Callable[[Int[Array, ""], Array, Array, Array], Float[Array, "n ..."]]
 
 
 def value(augmented: Augmented, of: int) -> Callable[[Array, Array, Array], Array]:
@@ -90,34 +82,41 @@ def differentiated(augmented: Augmented, of: int, *, slope: bool = False) -> Dif
     x, u, p = _symbols(augmented)
     result = augmented.function(x, u, p)[of]
     result = casadi.densify(casadi.vec(casadi.jacobian(result, x).T) if slope else result)
-    in_x, in_u, in_p = (casadi.jacobian(result, v) for v in (x, u, p))
-    blocks = _blocks(in_p.sparsity())
-    tables = [casadi.vec(casadi.densify(in_p[b.rows, b.columns]).T) for b in blocks]
-    outs = [*(casadi.densify(casadi.vec(a.T)) for a in (in_x, in_u)), *tables]
-    names = [f"o{k}" for k in range(len(outs))]
-    program = jax.jit(to_jax_rows(casadi.Function("slopes", [x, u, p], casadi.cse(outs), NAMES, names)))
-    n, nx, nu, dp = result.numel(), x.numel(), u.numel(), p.numel()
+    outs = [casadi.densify(casadi.vec(casadi.jacobian(result, v).T)) for v in (x, u)]
+    program = jax.jit(to_jax_rows(casadi.Function("slopes", [x, u, p], casadi.cse(outs), NAMES, ["by_x", "by_u"])))
+    in_p = casadi.jacobian(result, p)
+    n, nx, nu = result.numel(), x.numel(), u.numel()
 
     def slopes(x: Array, u: Array, p: Array) -> Slopes:
-        by_x, by_u, *by_p = (_finite(a) for a in program(x, u, p))
+        by_x, by_u = (_finite(a) for a in program(x, u, p))
         points = x.shape[1:]
-        tables = (a.reshape(len(b.rows), len(b.columns), *points) for a, b in zip(by_p, blocks, strict=True))
-        return Slopes(by_x.reshape(n, nx, *points), by_u.reshape(n, nu, *points), tuple(tables))
+        return Slopes(by_x.reshape(n, nx, *points), by_u.reshape(n, nu, *points))
 
-    def along(slopes: Slopes, row: Array) -> Array:
-        points = slopes.by_x.shape[2:]
-        rows: list[Array] = [jnp.zeros(points, slopes.by_x.dtype)] * n
-        wide = row.reshape(*(1,) * (len(points) - row.ndim), *row.shape)
-        for block, table in zip(blocks, slopes.by_p, strict=True):
-            place = np.full(dp + 1, -1)  # a row beyond the last moves nothing
-            place[block.columns] = np.arange(len(block.columns))
-            at = jnp.asarray(place)[jnp.minimum(wide, dp)]
-            column = jnp.take_along_axis(table, jnp.maximum(at, 0)[None, None], axis=1)[:, 0]
-            for k, i in enumerate(block.rows):
-                rows[i] = rows[i] + jnp.where(at >= 0, column[k], 0.0)
-        return jnp.stack(rows)
+    # one branch per parameter: of a hundred a fit moves a few, and a table of all would be most of its work
+    moving = [j for j in range(p.numel()) if in_p[:, j].nnz()]
+    branches = [_column(casadi.cse([in_p[:, j]]), (x, u, p)) for j in moving]
+    place = np.full(p.numel() + 1, len(moving))
+    place[moving] = np.arange(len(moving))
+
+    def along(row: Array, x: Array, u: Array, p: Array) -> Array:
+        nothing = lambda x, u, p: jnp.zeros((n, *x.shape[1:]), x.dtype)  # noqa: E731
+        return jax.lax.switch(jnp.asarray(place)[row], [*branches, nothing], x, u, p)
 
     return Differentiated(slopes, along)
+
+
+def _column(result: list[casadi.SX], arguments: tuple[casadi.SX, ...]) -> Callable[[Array, Array, Array], Array]:
+    """Return (x, u, p) -> a column of a Jacobian, (n, ...), of which most entries are zeros."""
+    (column,) = result
+    there = column.sparsity().row()
+    program = to_jax_rows(casadi.Function("column", [*arguments], [casadi.densify(column[there])], NAMES, ["v"]))
+
+    def at(x: Array, u: Array, p: Array) -> Array:
+        everywhere = jnp.broadcast_to(p, (len(p), *x.shape[1:]))
+        found = dict(zip(there, _finite(program(x, u, everywhere)[0]), strict=True))
+        return jnp.stack([found.get(i, jnp.zeros(x.shape[1:], x.dtype)) for i in range(column.numel())])
+
+    return at
 
 
 def _symbols(augmented: Augmented) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
@@ -128,22 +127,3 @@ def _symbols(augmented: Augmented) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
 def _finite(slopes: Array) -> Array:
     """The slope of sqrt(max(h, 0)) at an empty tank is infinite or nan: there it counts as zero."""
     return jnp.where(jnp.isfinite(slopes), slopes, 0.0)
-
-
-class _Block(NamedTuple):
-    """Parameters that act on the same results."""
-
-    rows: list[int]
-    columns: list[int]
-
-
-def _blocks(sparsity: casadi.Sparsity) -> list[_Block]:
-    """Gather parameters by the results that they act on: most act on one, and all other rows would be zeros."""
-    columns = np.repeat(np.arange(sparsity.size2()), np.diff(sparsity.colind())).tolist()
-    rows_of: dict[int, set[int]] = {}
-    for i, j in zip(sparsity.row(), columns, strict=True):
-        rows_of.setdefault(j, set()).add(i)
-    groups: dict[frozenset[int], list[int]] = {}
-    for j, rows in sorted(rows_of.items()):
-        groups.setdefault(frozenset(rows), []).append(j)
-    return [_Block(sorted(rows), columns) for rows, columns in groups.items()]

@@ -34,7 +34,7 @@ from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
-from simpel_cli.filtering.likelihood.small_matrices import along, apart, product
+from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT, SENSOR_DELAY, SENSOR_LAG
@@ -139,28 +139,29 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         return jax.lax.scan(step, x, u)[0]
 
-    def flow_with_slope(p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    def flow_with_slope(p: Array, x: Array, u: Array, sure: Array) -> tuple[tuple[Array, Array, Array, Array], Any]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative.
 
-        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...).
+        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...), and
+        the slopes of the rates there.
         """
 
-        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
+        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
             h, h_phi = length(u), length(u, 2)
             there = x + h * weights[0] * slope
-            slope, rate_x = apart(rates(there, u, p))
-            slope_phi = apart(product(rate_x, apart(phi + h_phi * weights[0] * slope_phi)))
+            slope, rate_x = apart(sure, rates, there, u, p)
+            slope_phi = apart(sure, product, rate_x, phi + h_phi * weights[0] * slope_phi)
             end, end_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
-            return (x, phi, end, end_phi, slope, slope_phi, rate_x), there
+            return (x, phi, end, end_phi, slope, slope_phi, rate_x), (there, rate_x)
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
-        def step(carry: Any, u: Array) -> tuple[Any, Array]:
+        def step(carry: Any, u: Array) -> tuple[Any, tuple[Array, Array]]:
             x, phi, *_ = carry
-            end, there = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
-            return (end[2], end[3], end[4], end[6]), there[jnp.array([0, 2, 3])]
+            end, passed = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
+            return (end[2], end[3], end[4], end[6]), jax.tree.map(lambda a: a[jnp.array([0, 2, 3])], passed)
 
         return jax.lax.scan(step, (x, unit, *nothing), u)
 
@@ -201,8 +202,21 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             return error
         return jnp.where(along(jnp.array(wraps), error.ndim - 1), jnp.mod(error + jnp.pi, 2 * jnp.pi) - jnp.pi, error)
 
+    def taken(
+        state: tuple[Array, Array, Array], reach: Array, off: Array, c: Array, noise: Array, ok: Array
+    ) -> tuple[Array, ...]:
+        """Take one measurement in: state and covariance after it, innovation, variance and gain.
+
+        `state`: as predicted for the row, now, and its covariance; `reach`: covariance with what is read; `c`: slope of that.
+        """
+        predicted, x, cov = state
+        s = product(c[None], reach[:, None])[0, 0] + noise
+        e = off - product(c[None], (x - predicted)[:, None])[0, 0]
+        gain = (ok / s)[None] * reach
+        return x + gain * e[None], cov - gain[:, None] * reach[None], e, s, gain
+
     def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
-        u_sub, half = inputs(p, u), of_half_a_row(noise.q, dt)
+        u_sub, half, sure = inputs(p, u), of_half_a_row(noise.q, dt), sure_of(noise.r)
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
             x, cov, u_before, rate, rate_x, jumps, begin = carry
@@ -215,25 +229,21 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
-                c = slope[j]
-                reach = apart(product(cov, c[:, None])[:, 0])
-                s = product(c[None], reach[:, None])[0, 0] + noise.r[j] ** 2 * larger[j]
-                e = off[j] - product(c[None], (x - predicted)[:, None])[0, 0]
-                gain = apart((ok_k[j] / s)[None] * reach)
+                # what is worked out apart, is so at once: it sees the values of this turn of the loop
+                reach = apart(sure, applied, cov, slope[j])
+                given = (predicted, x, cov), reach, off[j], slope[j], noise.r[j] ** 2 * larger[j], ok_k[j]
+                x, cov, e, s, gain = apart(sure, taken, *given)
                 errors.append(e)
                 variances.append(s)
                 gains.append(gain)
-                x = x + gain * e[None]
-                cov = cov - gain[:, None] * reach[None]
-                x, cov = apart((x, cov))
-            (following, jacobian, rate_after, rate_x_after), passed = flow_with_slope(p, x, u_k)
+            (following, jacobian, rate_after, rate_x_after), passed = flow_with_slope(p, x, u_k, sure)
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
-            held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, passed, *before)
+            held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, *passed, *before)
             begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
             carry = (
                 following,
-                after(cov, jacobian, of_row(half, pace)),
+                after(cov, jacobian, of_row(half, pace), sure),
                 u_k[-1, -1],
                 rate_after,
                 rate_x_after,

@@ -264,7 +264,7 @@ def _evaluate(
     track, held = rule.track(each(p), loud, *tiled)
     _, ok, u, _, spread = tiled
     index = course.index[:, n_r + n_q :].T
-    rows = each(jnp.where(index < n_p, index, n_p))  # padding is no parameter of the model
+    rows = jnp.where(index < n_p, index, n_p)  # padding is no parameter of the model
     ways, pushes = rule.pushes(each(p), rows, track, held, u)
 
     def speed(i: Array) -> Array:

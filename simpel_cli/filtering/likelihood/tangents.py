@@ -27,7 +27,7 @@ from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, 
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, pushed
-from simpel_cli.filtering.likelihood.small_matrices import product
+from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
 SMALL = 3  # states of a model whose covariance follows the parameters
@@ -70,52 +70,62 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
     dt, substeps, late_by = timing.dt, timing.substeps, timing.late_by
 
     def pushes(p: Array, rows: Array, at: Track, held: Held, u: Array) -> tuple[Ways, Pushes]:
-        units = jax.vmap(lambda row: _unit(p, row))(rows)
+        sure = sure_of(at.variance)
+        units = jax.vmap(lambda row: _unit(p, row))(_at_each(rows, p))
         moved = moved_before = None
+        asked = jnp.asarray(False)
         if timing.of_inputs:
             asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
             moved = jnp.moveaxis(
                 _if(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
             )
             moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
-        late = None if late_by is None else (late_by(p), _along(late_by, p, units))
+        at_rows = lambda a: jnp.expand_dims(a, a.ndim - p.ndim + 1)  # noqa: E731
+        late = None if late_by is None else jax.tree.map(at_rows, (late_by(p), _along(late_by, p, units)))
         before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
 
-        def of(row: tuple[Any, ...]) -> tuple[Ways, Pushes]:
-            return _of_row(p, rows, late, *row)
+        def of(part: tuple[Any, ...]) -> tuple[Ways, Pushes]:
+            """Rows are points like others: their axis goes in front of those of the points, and back."""
+            found = _of_rows(
+                at_rows(p), rows, asked, late, sure, *jax.tree.map(lambda a: jnp.moveaxis(a, 0, -p.ndim), part)
+            )
+            return jax.tree.map(lambda a: jnp.moveaxis(a, -p.ndim, 0), found)
 
         size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
         ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
         if found.bent is not None:
             assert bend is not None
             begin = at.predicted[0], before[0], None if moved_before is None else moved_before[0]
-            start = _at_points(bend, p, rows, *begin)[1]
+            start = _pushed(bend, p, rows, *begin, asked)
             found = found._replace(bent=jnp.concatenate([start.reshape(1, *found.bent.shape[1:]), found.bent[:-1]]))
-        return ways, jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), found)
+        return ways, found
 
-    def _of_row(
-        p: Array, rows: Array, late: Any, predicted: Array, held: Held, before: Array, moved: Any, moved_before: Any
-    ) -> tuple[Ways, Pushes]:
-        """Do so for one row; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
+    def _of_rows(
+        p: Array, rows: Array, asked: Array, late: Any, sure: Array, predicted: Array, held: Held, before: Array, moved: Any,
+        moved_before: Any,
+    ) -> tuple[Ways, Pushes]:  # fmt: skip
+        """Do so for rows, the first axis of the points; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
         u = held.u[:, _stages_of(held.u.shape[1])]  # (substeps, 3, nu, ...)
         x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
         moved_s = None
         if moved is not None:
             moved_s = jnp.moveaxis(moved[:, :, _stages_of(moved.shape[2])], 3, 1)
-        slopes, push = _at_points(rates, p, rows, x_s, u_s, moved_s)
+        push = _pushed(rates, p, rows, x_s, u_s, moved_s, asked)
+        by_x = jnp.moveaxis(held.stage_x, (2, 3), (0, 1))
         h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
-        state = jax.vmap(lambda g: _composed(slopes.by_x, g, h))(push)
+        state = jax.vmap(lambda g: _composed(by_x, g, h, sure))(push)
 
         first_of = lambda a: None if a is None else a[:, :, 0, 0]  # noqa: E731
         early = early_of(held.u[0, 0], nu)
         first = now = end = push_first = push_now = push_end = None
         if late is not None or early is not None:
-            slopes_now, push_now = _at_points(rates, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s))
-            first, now, end = slopes.by_x[:, :, 0, 0], slopes_now.by_x, slopes.by_x[:, :, -1, -1]
+            begin = predicted, u_s[:, 0, 0]
+            push_now = _pushed(rates, p, rows, *begin, first_of(moved_s), asked)
+            first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
             push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
-        reading = _at_points(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s))[1]
+        reading = _pushed(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s), asked)
         if early is not None:
-            then = _at_points(sensors, p, rows, predicted, before, moved_before)[1]
+            then = _pushed(sensors, p, rows, predicted, before, moved_before, asked)
             reading = jax.vmap(lambda a, b: chosen(early, a, b))(then, reading)
         if late is not None:
 
@@ -129,9 +139,10 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         turn = push_turn = push_bent = None
         if bend is not None:
             moved_ends = None if moved_s is None else jax.vmap(_ends)(moved_s)
-            bends, turned = _at_points(bend, p, rows, _ends(x_s), _ends(u_s), moved_ends)
+            turned = _pushed(bend, p, rows, _ends(x_s), _ends(u_s), moved_ends, asked)
             squares = turned.reshape(len(rows), nx, nx, *turned.shape[2:])
-            turn = bends.by_x.reshape(nx, nx, nx, *bends.by_x.shape[2:])
+            turn = _slopes(bend, p, _ends(x_s), _ends(u_s)).by_x
+            turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
             push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
             push_bent = squares[:, :, :, 1] if early is not None else None
         return Ways(first, now, end, turn), Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
@@ -169,7 +180,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
     ) -> tuple[Array, Array]:
         late = None if late_by is None else late_by(p)
         rows = _Rows(at, held, counted(ok), ways, None if held.pace is None else _shifted(dt * held.pace, dt))
-        half = of_half_a_row(noise.q, dt)
+        half, sure = of_half_a_row(noise.q, dt), sure_of(noise.r)
 
         def along(louder: Noise | None, push: Pushes | None) -> tuple[Array, Array]:
             """Derivatives in one direction: of the noise, or along a push."""
@@ -179,13 +190,13 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
                 of_half = jax.jvp(lambda q: of_half_a_row(q, dt), (noise.q,), (louder.q,))[1]
 
             def row(moved: _Moved, data: tuple[_Rows, Pushes | None]) -> tuple[_Moved, tuple[Array, Array]]:
-                return _after_row(moved, *data, late, half, of_r, of_half)
+                return _after_row(moved, *data, late, half, of_r, of_half, sure)
 
             return jax.lax.scan(row, _first(rows, push, follows=push is None or nx <= SMALL), (rows, push))[1]
 
         loud, pushed = (
             jax.vmap(lambda each: along(each, None))(louder),
-            jax.vmap(lambda each: along(None, each))(pushes),
+            jax.vmap(lambda each: along(None, each), in_axes=1)(pushes),
         )
         return jnp.concatenate([loud[0], pushed[0]]), jnp.concatenate([loud[1], pushed[1]])
 
@@ -212,11 +223,12 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
         half: Array,
         of_r: Array | None,
         of_half: Array | None,
+        sure: Array,
     ) -> tuple[_Moved, tuple[Array, Array]]:
         state, cov, rate, jumps, begin, bent = moved
         at, held, (ok, larger), ways, step = row
         early, follows = early_of(held.u[0, 0], nu), not isinstance(cov, tuple)
-        read = product(held.prompt, state[:, None])[:, 0]
+        read = applied(held.prompt, state)
         if push is not None:
             read = read + push.reading
         if early is not None:
@@ -224,7 +236,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
         if late is not None:
             assert ways.now is not None
             read = read + jnp.sum(held.prompt * back(*late, rate, held.rate_x), axis=1) + echo(*late, jumps, dt)
-            now = product(ways.now, state[:, None])[:, 0]
+            now = applied(ways.now, state)
             jumps = pushed(jumps, held.prompt, rate, now if push is None or push.now is None else now + push.now)
         turned = None
         if early is not None and ways.turn is not None and follows:
@@ -238,26 +250,26 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
             if turned is not None:
                 de = de - product(turned[j][None], learned[:, None])[0, 0]
                 learned = learned + gain * e[None]
-            state = state + gain * de[None]
-            if (
-                follows
-            ):  # dP+ = dP - v g' - g v' + g g' ds, v = d(P c): the gain is optimal, so that its own change drops out
-                v = product(cov, c[:, None])[:, 0]
+            if follows:
+                # v = d(P c); the gain is optimal, so that its own change drops out:
+                # dP+ = dP - v g' - g v' + g g' ds
+                v = apart(sure, applied, cov, c)
                 ds = ds + product(c[None], v[:, None])[0, 0]
                 if turned is not None:
-                    reach, more = product(known, c[:, None])[:, 0], product(known, turned[j][:, None])[:, 0]
+                    reach, more = applied(known, c), product(known, turned[j][:, None])[:, 0]
                     v, ds = v + more, ds + 2 * product(c[None], more[:, None])[0, 0]
                     known = known - gain[:, None] * reach[None]
-                state = state + (v - gain * ds[None]) * (ok[j] * e / s)[None]
-                both = gain[:, None] * (v - gain * (ds / 2)[None])[None]
-                cov = cov - both - jnp.swapaxes(both, 0, 1)
+                state, cov = apart(sure, _after_reading, state, cov, gain, de, ds, v, ok[j] * e / s)
+            else:
+                state = state + gain * de[None]
             of_e.append(de)
             of_s.append(ds)
-        end = product(at.jacobian, state[:, None])[:, 0]
+        end = applied(at.jacobian, state)
         end = end if push is None else end + push.state
         if follows:
             jacobian, noisy = at.jacobian, cov if of_half is None else cov + of_row(of_half, held.pace)
-            cov = product(product(jacobian, noisy), jnp.swapaxes(jacobian, 0, 1))
+            reached = apart(sure, product, jacobian, noisy)
+            cov = product(reached, jnp.swapaxes(jacobian, 0, 1))
             cov = cov if of_half is None else cov + of_row(of_half, held.pace)
             if ways.turn is not None:
                 firsts, ends = (
@@ -267,19 +279,33 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
                 change = change if push is None or push.turn is None else change + push.turn
                 change = change * (dt / 2 if held.pace is None else dt / 2 * held.pace[None, None])
                 carried = product(at.cov + of_row(half, held.pace), jnp.swapaxes(jacobian, 0, 1))
-                one = product(product(jacobian, change) + product(change, jacobian), carried)
+                bending = apart(sure, _both_ways, jacobian, change)
+                one = product(bending, carried)
                 cov = cov + one + jnp.swapaxes(one, 0, 1)
                 if early is not None:
                     bent = ends
         if ways.first is not None:
             assert ways.end is not None
-            firsts, rate = product(ways.first, state[:, None])[:, 0], product(ways.end, end[:, None])[:, 0]
+            firsts, rate = applied(ways.first, state), applied(ways.end, end)
             if push is not None and push.first is not None:
                 firsts, rate = firsts + push.first, rate + _there(push.end)
             begin = begin if early is None else (state, firsts)
         return _Moved(end, cov, rate, jumps, begin, bent), (jnp.stack(of_e), jnp.stack(of_s))
 
     return slopes
+
+
+def _after_reading(
+    state: Array, cov: Array, gain: Array, de: Array, ds: Array, v: Array, surprise: Array
+) -> tuple[Array, Array]:
+    """Return how a reading moves the change of the state and of its covariance."""
+    both = gain[:, None] * (v - gain * (ds / 2)[None])[None]
+    state = state + gain * de[None] + (v - gain * ds[None]) * surprise[None]
+    return state, cov - both - jnp.swapaxes(both, 0, 1)
+
+
+def _both_ways(a: Array, b: Array) -> Array:
+    return product(a, b) + product(b, a)
 
 
 def _there(value: Array | None) -> Array:
@@ -293,16 +319,57 @@ def _shifted(pace: Array, first: float) -> Array:
     return jnp.concatenate([jnp.full_like(pace[:1], first), pace[:-1]])
 
 
-def _at_points(
-    of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved: Array | None
-) -> tuple[Slopes, Array]:
-    """Slopes, and what every direction adds, (D, n, ...), at points (nx, ...), (nu, ...), (D, nu, ...)."""
-    own = x.ndim - p.ndim
-    slopes = of.slopes(x, u, jnp.broadcast_to(p.reshape(len(p), *(1,) * own, *p.shape[1:]), (len(p), *x.shape[1:])))
-    found = jax.vmap(lambda row: of.along(slopes, row))(rows)
-    if moved is not None:
-        found = found + jax.vmap(lambda d: product(slopes.by_u, d[:, None])[:, 0])(moved)
-    return slopes, found
+def _slopes(of: Differentiated, p: Array, x: Array, u: Array) -> Slopes:
+    """Slopes at points (nx, ...), (nu, ...), the last axes of which p has."""
+    return of.slopes(x, u, jnp.broadcast_to(_beside(p, x), (len(p), *x.shape[1:])))
+
+
+def _pushed(of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved: Array | None, asked: Array) -> Array:
+    """Return what every direction adds, (D, n, ...), at such points.
+
+    Args:
+        of: the function.
+        p: parameters.
+        rows: directions (see `Filter`).
+        x: states.
+        u: inputs.
+        moved: (D, nu, ...) how these change; None: they do not.
+        asked: whether they do in any direction.
+    """
+    found = _along_rows(of, rows, x, u, _beside(p, x))
+    if moved is None:
+        return found
+
+    def by_inputs() -> Array:
+        by_u = _slopes(of, p, x, u).by_u
+        return jax.vmap(lambda d: applied(by_u, d))(moved)
+
+    return found + _if(asked, by_inputs)
+
+
+def _beside(p: Array, x: Array) -> Array:
+    return p.reshape(len(p), *(1,) * (x.ndim - p.ndim), *p.shape[1:])
+
+
+def _along_rows(of: Differentiated, rows: Array, x: Array, u: Array, p: Array) -> Array:
+    """Derivatives in p[row] for each of rows, (D, n, ...), or (D, L) of which each is for a part of the last axis.
+
+    The points of a part share their parameters.
+    """
+    if rows.ndim == 1:
+        return jax.lax.map(lambda row: of.along(row, x, u, p), rows)
+    parts = rows.shape[1]
+    given = [jnp.moveaxis(a.reshape(*a.shape[:-1], parts, a.shape[-1] // parts), -2, 0) for a in (x, u, p)]
+    given[2] = given[2][..., :1]  # numbers: what is made of them alone is made once
+
+    def one(at: tuple[Array, Array]) -> Array:
+        row, part = at
+        return of.along(row, *(jax.lax.dynamic_index_in_dim(a, part, keepdims=False) for a in given))
+
+    which = jnp.broadcast_to(jnp.arange(parts), rows.shape)
+    found = jax.lax.map(one, (rows.ravel(), which.ravel()))
+    found = jnp.moveaxis(found.reshape(*rows.shape, *found.shape[1:]), 1, -2)
+    return found.reshape(*found.shape[:-2], -1)
 
 
 def _stages_of(count: int) -> Array:
@@ -320,14 +387,14 @@ def _turned_back(early: Array, prompt: Array, rate_x: Array, bent: Array) -> Arr
     return jax.jvp(lambda a: slope_back(early, prompt, a), (rate_x,), (bent,))[1]
 
 
-def _composed(by_x: Array, push: Array, h: Array | float) -> Array:
+def _composed(by_x: Array, push: Array, h: Array | float, sure: Array) -> Array:
     """Return what a push of the rates, (nx, substeps, 3, ...), leads to at the end of the row: the integrator's derivative."""
 
     def step(moved: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
         a, g = now
 
         def rate(k: int, x: Array) -> Array:
-            return product(a[:, :, k], x[:, None])[:, 0] + g[:, k]
+            return apart(sure, applied, a[:, :, k], x) + g[:, k]
 
         k1 = rate(0, moved)
         k2 = rate(1, moved + h / 2 * k1)
@@ -337,6 +404,13 @@ def _composed(by_x: Array, push: Array, h: Array | float) -> Array:
 
     start = jnp.zeros((push.shape[0], *push.shape[3:]), push.dtype)
     return jax.lax.scan(step, start, (jnp.moveaxis(by_x, 2, 0), jnp.moveaxis(push, 1, 0)))[0]
+
+
+def _at_each(rows: Array, p: Array) -> Array:
+    """Return the row of every direction at every point, (D, ...)."""
+    if rows.ndim == 1:
+        return jnp.broadcast_to(rows.reshape(-1, *(1,) * (p.ndim - 1)), (len(rows), *p.shape[1:]))
+    return jnp.repeat(rows, p.shape[-1] // rows.shape[1], axis=1)
 
 
 def _unit(p: Array, row: Array) -> Array:
@@ -356,13 +430,13 @@ def _if(asked: Array, worked_out: Callable[[], Array]) -> Array:
 
 
 def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
-    """Map a function over rows, so many at once."""
+    """Apply a function of rows, which lead, to so many at once."""
     count = len(jax.tree.leaves(rows)[0])
     parts = -(-count // size)
     if parts == 1:
-        return jax.vmap(function)(rows)
+        return function(rows)
     size = -(-count // parts)
     filled = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], parts * size - count, axis=0)]), rows)
     apart = jax.tree.map(lambda a: a.reshape(parts, size, *a.shape[1:]), filled)
-    found = jax.lax.map(jax.vmap(function), apart)
+    found = jax.lax.map(function, apart)
     return jax.tree.map(lambda a: a.reshape(parts * size, *a.shape[2:])[:count], found)

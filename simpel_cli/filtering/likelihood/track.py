@@ -35,6 +35,7 @@ class Held(NamedTuple):
     pace: Float[Array, "T ..."] | None  # step to the next row, in dt; None: all are dt
     u: Float[Array, "T substeps K nu ..."]  # as they arrive, and what stands behind the inputs
     stages: Float[Array, "T substeps 3 nx ..."]  # states at the beginning, in the middle and at the end of a substep
+    stage_x: Float[Array, "T substeps 3 nx nx ..."]  # slope of the rates there
     rate: Float[Array, "T nx ..."] | None  # at the end of the row before; None: no sensor is late
     jumps: Float[Array, "T K ny ..."] | None  # of what the sensors read, before the row; None: no sensor is late
 
@@ -58,6 +59,8 @@ class Ways(NamedTuple):
 class Pushes(NamedTuple):
     """What one unit of a parameter adds along a track, where the state is the same; None: not needed.
 
+    D directions at every row.
+
     Args:
         state: to the state at the end of the row.
         reading: to what the sensors read.
@@ -66,13 +69,13 @@ class Pushes(NamedTuple):
         bent: to that slope at the end of the row before, or where the window begins.
     """
 
-    state: Float[Array, "T nx ..."]
-    reading: Float[Array, "T ny ..."]
-    first: Float[Array, "T nx ..."] | None
-    now: Float[Array, "T nx ..."] | None
-    end: Float[Array, "T nx ..."] | None
-    turn: Float[Array, "T nx nx ..."] | None
-    bent: Float[Array, "T nx nx ..."] | None
+    state: Float[Array, "T D nx ..."]
+    reading: Float[Array, "T D ny ..."]
+    first: Float[Array, "T D nx ..."] | None
+    now: Float[Array, "T D nx ..."] | None
+    end: Float[Array, "T D nx ..."] | None
+    turn: Float[Array, "T D nx nx ..."] | None
+    bent: Float[Array, "T D nx nx ..."] | None
 
 
 class Filter(NamedTuple):
@@ -81,8 +84,8 @@ class Filter(NamedTuple):
     Args:
         name: a digest of all that it is made of: filters of one name are the same.
         track: (p, noise, y, ok, u, start, spread) -> Track, for one window (see `Windows`), and Held.
-        pushes: (p, rows, track, held, u) -> Ways, and Pushes of every direction, which leads: of one unit of p[row], for each
-            of rows (D, ...); beyond the last row: nothing.
+        pushes: (p, rows, track, held, u) -> Ways, and Pushes: of one unit of p[row], for each of rows (D,), or (D, L) of which
+            each is for one of L parts of the points' last axis, of one p; beyond the last row: nothing.
         slopes: (p, noise, louder, track, held, ok, ways, pushes) -> derivatives of innovations and variances, (D, T, ny, ...)
             each: first in the directions of the noise that `louder` holds, then along the pushes.
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
