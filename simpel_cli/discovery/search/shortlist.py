@@ -63,8 +63,10 @@ def _gains(plan: Setup, z: np.ndarray, force: Force, inputs: np.ndarray, terms: 
     at = augmented.neutral.copy()
     at[: len(model.params)] = [coordinates.value(i, float(z[i])) for i in range(len(model.params))]
 
+    everywhere = augmented.function.map("everywhere", "serial", x.shape[1], [2], [])  # one p for all points
+
     def rates(p: np.ndarray) -> np.ndarray:
-        found = np.asarray(augmented.function(x, u, np.tile(p[:, None], x.shape[1]))[0])[driven]
+        found = np.asarray(everywhere(x, u, p)[0])[driven]
         return np.nan_to_num((found * weight[:, None]).ravel(), posinf=0.0, neginf=0.0)
 
     still = rates(at)

@@ -222,7 +222,7 @@ class Search:
         # functions without a name promise much where much is left: they keep no name from being fitted
         most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
-        found = self.fitter([starts[i][1] for i in going])
+        found = self.fitter([starts[i][1] for i in going], racing=True)
         fits: dict[int, list[Optimum]] = {}
         for i, optimum in zip(going, found, strict=True):
             fits.setdefault(starts[i][0], []).append(optimum)

@@ -53,9 +53,9 @@ def smooth(track: Track) -> Smoothed:
     )
     x, p = mean.copy(), cov.copy()
     moved, moved_cov = np.zeros_like(mean[:, 1:]), np.zeros_like(cov[:, 1:])
+    gains = _right_divide(cov[:, :-1] @ _t(jacobian[:, :-1]), predicted_cov[:, 1:])
     for k in range(mean.shape[1] - 2, -1, -1):
-        f = jacobian[:, k]
-        gain = _right_divide(cov[:, k] @ _t(f), predicted_cov[:, k + 1])
+        f, gain = jacobian[:, k], gains[:, k]
         x[:, k] += _apply(gain, x[:, k + 1] - predicted[:, k + 1])
         p[:, k] += gain @ (p[:, k + 1] - predicted_cov[:, k + 1]) @ _t(gain)
         p[:, k] = (p[:, k] + _t(p[:, k])) / 2
@@ -79,12 +79,10 @@ def _apply(a: np.ndarray, x: np.ndarray) -> np.ndarray:
 def _right_divide(a: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return a p^-1 of covariances p, scaled so that units do not matter."""
     scale = np.sqrt(np.maximum(np.diagonal(p, axis1=-2, axis2=-1), np.finfo(float).tiny))
-    outer, eye = scale[:, :, None] * scale[:, None, :], np.eye(p.shape[-1])
-    values, vectors = np.linalg.eigh(p / outer)
+    values, vectors = np.linalg.eigh(p / (scale[..., :, None] * scale[..., None, :]))
     # of a filter that is nearly sure, rounding can leave a variance below zero
-    factor = np.linalg.cholesky((vectors * np.maximum(values, JITTER)[:, None, :]) @ _t(vectors) + JITTER * eye)
-    half = np.linalg.solve(factor, _t(a / scale[:, None, :]))
-    return _t(np.linalg.solve(_t(factor), half)) / scale[:, None, :]
+    inverse = (vectors / (np.maximum(values, JITTER) + JITTER)[..., None, :]) @ _t(vectors)
+    return (a / scale[..., None, :]) @ inverse / scale[..., None, :]
 
 
 class Force(NamedTuple):
