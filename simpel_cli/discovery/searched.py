@@ -309,10 +309,16 @@ def _with(
         found.search.budget = ground.budget
         return assessor, found
 
+    def accept(found: Calibrated) -> tuple[Selection, list[Gate]] | Wider:
+        return accepted(found.search, assessor, found.base, options, terminal, ends=wider)
+
     assessor, found = begun_in(plan)
     if (ends := wider(found.search, found.base)) is not None:
         return ends
-    selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+    judged = accept(found)
+    if isinstance(judged, Wider):
+        return judged
+    selection, gates = judged
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
@@ -320,7 +326,10 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
         assessor, found = begun_in(plan)
-        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+        judged = accept(found)
+        if isinstance(judged, Wider):
+            return judged
+        selection, gates = judged
     if (ends := wider(found.search, selection.chosen)) is not None:
         return ends
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
@@ -334,7 +343,10 @@ def _with(
     if heavy is not None:
         found = heavy
         found.search.budget = ground.budget
-        selection, gates = accepted(found.search, assessor, found.base, options, terminal)
+        judged = accept(found)
+        if isinstance(judged, Wider):
+            return judged
+        selection, gates = judged
     search, windows = found.search, found.test
     by_simulations = None
     if options.simulations and not ground.budget.over("a search by simulations"):

@@ -36,8 +36,10 @@ class Gate(NamedTuple):
         harm: whether an error grows: of any channel, at any horizon, certainly and by more than `TOLERATED`. A model that
             predicts the next row better and all others worse has learnt to follow. One row ahead the likelihood judges, too;
             there a model that follows what it cannot explain has small errors, and may lose some of that.
-        passed: whether the lower end is positive and there is no harm.
+        passed: whether there is no harm, and the lower end is positive or, where the gain is, an error further ahead than one
+            row certainly falls by more than `TOLERATED`. What acts seldom, as an overflow does, gains much in few parts.
         grows: which errors grow, in words.
+        falls: which errors further ahead fall so.
     """
 
     gain: float
@@ -47,6 +49,7 @@ class Gate(NamedTuple):
     harm: bool
     passed: bool
     grows: tuple[str, ...] = ()
+    falls: tuple[str, ...] = ()
 
 
 def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
@@ -229,8 +232,13 @@ def _judged(
     """Judge gains (W,) and errors without and with an effect; groups: (W,), and of free runs `runs` where it is given."""
     per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
     low, high = gain_interval(per_group, np.random.default_rng(1))
-    grows = growing(before, after, measured, groups if runs is None else {AHEAD["free"]: runs, "": groups})
-    return Gate(float(gains.sum()), low, high, unit, bool(grows), bool(low > 0) and not grows, grows)
+    of = groups if runs is None else {AHEAD["free"]: runs, "": groups}
+    grows = growing(before, after, measured, of)
+    further = [words for words in before if words != AHEAD["one_step"]]
+    falls = growing({words: after[words] for words in further}, before, measured, of)
+    total = float(gains.sum())
+    helps = bool(low > 0) or (total > 0 and bool(falls))
+    return Gate(total, low, high, unit, bool(grows), helps and not grows, grows, falls)
 
 
 def errors_of(found: Assessment) -> Errors:

@@ -86,6 +86,20 @@ def further(search: Search, found: Selection) -> Selection:
     return _settled(search, grown._replace(stages=stages))
 
 
+def widely(search: Search, found: Selection) -> Selection:
+    """Search once more with effects that begin anywhere in their ranges: one of them first, or beside what was chosen."""
+    if search.budget.over("effects that begin anywhere in their ranges"):
+        return found
+    search.report("beginning anywhere in the ranges of effects")
+    paths = [found.path[:1], found.path] if found.chosen.terms else [found.path]
+    others = [_grow(search, path, widely=True) for path in paths]
+    best = max(others, key=lambda g: worth(g.path[-1]))
+    stages = found.stages + tuple(stage for grown in others for stage in grown.stages)
+    if worth(best.path[-1]) < worth(found.chosen) + ASTRAY:
+        return found._replace(stages=stages)
+    return _settled(search, best._replace(stages=stages))
+
+
 def _settled(search: Search, grown: _Grown) -> Selection:
     """Drop what is not needed in the end, put one term in the place of two where one will do, and name the rivals."""
     for merger in range(MOST_MERGERS + 1):
@@ -131,15 +145,22 @@ def _nameless(search: Search, trial: Trial) -> bool:
     return bool(search.terms[trial.terms[-1]].depends_on)
 
 
-def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
-    """Add one effect after another to the end of a path, as long as they earn their place."""
+def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False) -> _Grown:
+    """Add one effect after another to the end of a path, as long as they earn their place.
+
+    Args:
+        search: over sets of effects.
+        path: to begin with.
+        widely: the first one, and one at the end, may begin anywhere in its ranges.
+    """
     stages: list[Stage] = []
+    wide = widely
     remainder = None
     while True:
         current = path[-1]
         if current.terms and search.budget.over("effects beside those found"):
             return _Grown(path, tuple(stages), None)
-        stage = search.add(current, search.candidates(current.terms))
+        stage = search.add(current, search.candidates(current.terms), widely=wide)
         trials = stage.trials
         if trials and trials[0].optimum.log_evidence - current.optimum.log_evidence > GUARD:
             again = search.fitter(
@@ -160,10 +181,13 @@ def _grow(search: Search, path: tuple[Trial, ...]) -> _Grown:
             t.optimum.log_evidence - current.optimum.log_evidence if t else -np.inf for t in (best, unnamed)
         )
         if best is None or not gain > least or len(current.terms) == MOST_EFFECTS:
+            if widely and not wide and len(current.terms) < MOST_EFFECTS:
+                wide = True
+                continue
             if unnamed is not None and gain_unnamed > ACCEPT:
                 remainder = (search.terms[unnamed.terms[-1]], float(gain_unnamed))
             return _Grown(path, tuple(stages), remainder)
-        path = (*path, best)
+        path, wide = (*path, best), False
         search.report(f"{search.terms[best.terms[-1]].label} +{gain:.0f}")
 
 

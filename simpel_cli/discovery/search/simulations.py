@@ -12,6 +12,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted
 from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, names_of
@@ -73,7 +74,9 @@ def chosen_by_simulations(
         )
         path.append(simulated.best(trial.terms, simulated.fitter([start])))
     own = path[-1]
-    other, gates = accepted(simulated, assessor, path[0], options, terminal, tuple(path))
+    judged = accepted(simulated, assessor, path[0], options, terminal, tuple(path))
+    assert not isinstance(judged, Wider)  # of ranges it is not asked
+    other, gates = judged
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")

@@ -29,6 +29,7 @@ KEPT = 4  # starts of a stage that are fitted in any case
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
 NEARLY = 0.01  # of a parameter's range
 QUIETER = 0.1  # of the range of log q, than at the very start
+ANYWHERE = 3  # starts of an effect anywhere in the ranges of its parameters
 STARTS = 6  # of the model as it is
 SPREADS = (0.03, 0.1, 0.35, 1.0)  # of groups, of their largest
 
@@ -198,20 +199,41 @@ class Search:
             for hypothesis in self.hypotheses((*before.terms, t), t, before.optimum.z)
         ]
 
-    def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING) -> Stage:
+    def anywhere(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Hypothesis]]:
+        """Return starts of the candidates that have a shape, anywhere in the ranges of what they are made of.
+
+        What has but a size promises beside the model without it what it is worth. An edge, a level or a share may promise
+        nothing from where it begins, and be most of what is missing.
+        """
+        random = np.random.default_rng(0)
+        starts = []
+        for t in candidates:
+            for _ in range(ANYWHERE if len(self.rows[t]) > 1 and not self.terms[t].depends_on else 0):
+                z = self.loud(before.optimum.z)
+                z[list(self.rows[t])] = random.uniform(NEARLY, 1 - NEARLY, len(self.rows[t]))
+                z[list(self.spreads_of[t])] = BEGIN
+                starts.append((t, Hypothesis(z, self.free((*before.terms, t)), self.ones)))
+        return starts
+
+    def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING, *, widely: bool = False) -> Stage:
         """Fit `before` with one of the candidates more, each from its promising starts; best first.
 
         Args:
             before: the model without it.
             candidates: terms.
             least: nats that a start must promise to be fitted.
+            widely: fit them from `anywhere`, too, whatever that promises.
         """
-        name = before.terms, before.optimum.z.tobytes(), tuple(candidates), least
+        name = before.terms, before.optimum.z.tobytes(), tuple(candidates), least, widely
         if name not in self.asked:
-            self.asked[name] = self._added(before, candidates, least)
+            self.asked[name] = self._added(
+                before, candidates, least, self.anywhere(before, candidates) if widely else ()
+            )
         return self.asked[name]
 
-    def _added(self, before: Trial, candidates: Sequence[int], least: float) -> Stage:
+    def _added(
+        self, before: Trial, candidates: Sequence[int], least: float, more: Sequence[tuple[int, Hypothesis]]
+    ) -> Stage:
         self.tried += len(candidates)
         starts = self.starts(before, candidates)
         scores = self.promises(before, starts)
@@ -222,10 +244,10 @@ class Search:
         # functions without a name promise much where much is left: they keep no name from being fitted
         most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
-        found = self.fitter([starts[i][1] for i in going], racing=True)
+        begun = [*(starts[i] for i in going), *more]
         fits: dict[int, list[Optimum]] = {}
-        for i, optimum in zip(going, found, strict=True):
-            fits.setdefault(starts[i][0], []).append(optimum)
+        for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun], racing=True), strict=True):
+            fits.setdefault(t, []).append(optimum)
         # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
         astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
         for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):

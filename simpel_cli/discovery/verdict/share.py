@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-NEAR = 3.0  # times the measurement noise: errors so small are near the floor
+from simpel_cli.discovery.search.near import NEAR
+
 MOST = 0.5  # of the residual: what explains less, with something left, does not explain it
 SOME = 0.1  # likewise, where nothing is left that is no white noise
 
