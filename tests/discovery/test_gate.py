@@ -71,6 +71,32 @@ def test_noise_is_no_harm() -> None:
     assert said <= 2
 
 
+@pytest.mark.parametrize(
+    ("total", "falls_ahead", "other", "passes"),
+    [(60.0, 0.7, 1.0, True), (-60.0, 0.7, 1.0, False), (60.0, 1.0, 1.0, False), (60.0, 0.7, 1.3, False)],
+)
+def test_an_error_ahead_that_certainly_falls_passes_what_gains_in_few_parts(
+    total: float, falls_ahead: float, other: float, passes: bool
+) -> None:
+    """Of ten parts two gain much, which resampling cannot be sure of."""
+    random = np.random.default_rng(0)
+    gains = np.array([total, total, *np.full(8, -total / 10)])
+    before = {words: random.normal(size=(10, 50, 2)) for words in AHEAD.values()}
+    after = dict(before) | {AHEAD["ahead"]: before[AHEAD["ahead"]] * np.array([falls_ahead, other])}
+    judged = _judged(gains, before, after, ("a", "b"), np.arange(10), "block")
+    assert judged.low < 0
+    assert judged.passed == passes
+    assert judged.falls == (("a some rows ahead",) if falls_ahead < 1 else ())
+
+
+def test_one_row_ahead_a_smaller_error_passes_nothing() -> None:
+    random = np.random.default_rng(0)
+    before = {words: random.normal(size=(10, 50, 1)) for words in AHEAD.values()}
+    after = dict(before) | {AHEAD["one_step"]: 0.5 * before[AHEAD["one_step"]]}
+    gains = np.array([60.0, 60.0, *np.full(8, -6.0)])
+    assert not _judged(gains, before, after, ("a",), np.arange(10), "block").passed
+
+
 def test_a_channel_without_errors_says_nothing() -> None:
     before = np.random.default_rng(0).normal(size=(8, 50, 2))
     before[..., 1] = np.nan
@@ -98,7 +124,7 @@ class Fits:
     def on(self, windows: Windows) -> "Fits":
         return Fits(self.noise, windows)
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: bool = False) -> list[Optimum]:
         return [optimum(self.fitted(hypothesis)) for hypothesis in hypotheses]
 
     def fitted(self, hypothesis: Hypothesis) -> np.ndarray:

@@ -17,6 +17,7 @@ from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gate
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.selection import cut, further, select
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
@@ -35,7 +36,7 @@ class MadeUp:
     def __init__(self, row: int, neutral: float) -> None:
         self.row, self.neutral, self.far = row, neutral, 0
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: bool = False) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             far = abs(hypothesis.z[self.row] - self.neutral) > 0.02
@@ -111,7 +112,7 @@ class Table:
             return self.evidence[names]
         return max(self.of(names - {name}) for name in names) - 1
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: bool = False) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(hypothesis.free)}
@@ -363,6 +364,7 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
 
     count = iter(range(100))
     monkeypatch.setattr(acceptance, "gated_selection", gated)
+    monkeypatch.setattr(acceptance, "far", lambda *_: False)
     monkeypatch.setattr(acceptance, "select", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=())))
     monkeypatch.setattr(acceptance, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
     none: Any = None
@@ -371,6 +373,19 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
     selection, gates = unwrap(accepted)(search, none, none, options, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]
+
+
+def test_ranges_are_asked_before_anything_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(acceptance, "gated_selection", pytest.fail)
+    monkeypatch.setattr(acceptance, "far", lambda *_: True)
+    first, second = (SimpleNamespace(chosen=SimpleNamespace(terms=terms)) for terms in ((), (1,)))
+    monkeypatch.setattr(acceptance, "select", lambda *_: first)
+    monkeypatch.setattr(acceptance, "widely", lambda _, found: second if found is first else None)
+    none: Any = None
+    wider = Wider({"k": (0.0, 2.0)}, 9.0)
+    ends = lambda _, trial: wider if trial is second.chosen else None  # noqa: E731
+    options: Any = SimpleNamespace(beginnings=0)
+    assert unwrap(accepted)(none, none, none, options, none, (), ends) is wider
 
 
 @pytest.mark.parametrize(("formula", "stays"), [(96.0, True), (85.0, False)])
