@@ -343,9 +343,8 @@ def _with(
     if heavy is not None:
         found = heavy
         found.search.budget = ground.budget
-        judged = accept(found)
-        if isinstance(judged, Wider):
-            return judged
+        judged = accepted(found.search, assessor, found.base, options, terminal)
+        assert not isinstance(judged, Wider)  # of ranges it is not asked
         selection, gates = judged
     search, windows = found.search, found.test
     by_simulations = None

@@ -1,5 +1,8 @@
 """Effects with a shape may begin anywhere in their ranges: where a slope at the start tells nothing."""
 
+from inspect import unwrap
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_ranges import cart, searched
@@ -83,3 +86,21 @@ def test_where_it_finds_nothing_more_the_selection_stays(found: tuple[Search, Se
     again = widely(search, chosen)
     assert again.chosen == chosen.chosen
     assert again.gains == chosen.gains
+
+
+def test_a_model_that_runs_away_is_far_and_a_channel_without_errors_ahead_says_nothing(
+    found: tuple[Search, Selection],
+) -> None:
+    search, chosen = found
+    windows = search.plan.windows
+    innovation, ahead = np.zeros(windows.y.shape), np.zeros(windows.y.shape)
+    ahead[..., 1] = np.nan
+
+    def shown(*_: object) -> SimpleNamespace:
+        return SimpleNamespace(track=SimpleNamespace(innovation=innovation), ahead=ahead)
+
+    assert not unwrap(far)(search, shown, chosen.chosen)
+    innovation[0, -1, 0] = np.nan
+    assert unwrap(far)(search, shown, chosen.chosen)
+    innovation[0, -1, 0], ahead[..., 0] = 0.0, 1.0
+    assert unwrap(far)(search, shown, chosen.chosen)

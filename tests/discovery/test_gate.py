@@ -89,6 +89,17 @@ def test_an_error_ahead_that_certainly_falls_passes_what_gains_in_few_parts(
     assert judged.falls == (("a some rows ahead",) if falls_ahead < 1 else ())
 
 
+def test_of_few_parts_an_error_that_falls_passes_nothing() -> None:
+    random = np.random.default_rng(0)
+    gains = np.array([60.0, 60.0, *np.full(8, -6.0)])
+    before = {words: random.normal(size=(10, 50, 1)) for words in AHEAD.values()}
+    after = dict(before) | {FREE: 0.3 * before[FREE]}
+    parts = np.arange(10)
+    assert _judged(gains, before, after, ("a",), parts, "block", parts).passed
+    assert not _judged(gains, before, after, ("a",), parts, "block", np.zeros(10)).passed
+    assert not _judged(gains - gains.mean() + 0.01, before, after, ("a",), parts, "block", parts).passed
+
+
 def test_one_row_ahead_a_smaller_error_passes_nothing() -> None:
     random = np.random.default_rng(0)
     before = {words: random.normal(size=(10, 50, 1)) for words in AHEAD.values()}
@@ -124,7 +135,9 @@ class Fits:
     def on(self, windows: Windows) -> "Fits":
         return Fits(self.noise, windows)
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: bool = False) -> list[Optimum]:
+    def __call__(
+        self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: Sequence[bool] | None = None
+    ) -> list[Optimum]:
         return [optimum(self.fitted(hypothesis)) for hypothesis in hypotheses]
 
     def fitted(self, hypothesis: Hypothesis) -> np.ndarray:

@@ -38,15 +38,21 @@ LEADS = 3 * SLOW  # what the leader of a race gains in every round
 @pytest.mark.parametrize(
     ("behind", "gain", "rejected", "racing", "iterations"),
     [
-        (2 * BEHIND, LEADS, 0, True, 2 * ROUND),
-        (2 * BEHIND, 3 * BEHIND / LAPS, 0, True, MOST),
-        (0.8 * BEHIND, LEADS, 0, True, MOST),
-        (2 * BEHIND, LEADS, 1, True, MOST),
-        (2 * BEHIND, LEADS, 0, False, MOST),
+        (2 * BEHIND, LEADS, 0, (False, False), 2 * ROUND),
+        (2 * BEHIND, 3 * BEHIND / LAPS, 0, (False, False), MOST),
+        (0.8 * BEHIND, LEADS, 0, (False, False), MOST),
+        (2 * BEHIND, LEADS, 1, (False, False), MOST),
+        (2 * BEHIND, LEADS, 0, None, MOST),
+        (2 * BEHIND, LEADS, 0, (False, True), MOST),  # of another kind
     ],
 )
 def test_what_cannot_catch_up_leaves_a_race(
-    behind: float, gain: float, rejected: int, racing: bool, iterations: int, monkeypatch: pytest.MonkeyPatch
+    behind: float,
+    gain: float,
+    rejected: int,
+    racing: tuple[bool, bool] | None,
+    iterations: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plan = setup(model(), recording(), (), [LOAD], 2)
     fitter = Fitter(plan.rule, plan.coordinates, plan.windows, width=len(plan.start))

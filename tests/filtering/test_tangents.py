@@ -4,14 +4,17 @@ A filter that is deaf learns nothing from what it reads, so that its innovations
 derivative is that of the integrator. Several points at once, each with parameters of its own.
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import linear_plant
 import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.filtering.likelihood import tangents
 from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression
@@ -103,3 +106,21 @@ def test_derivatives_of_readings_are_those_of_differences(
         difference = np.asarray(read(jnp.asarray(p + unit)) - read(jnp.asarray(p - unit))) / (2 * STEP)
         assert np.abs(difference).max() > 1e-3  # it is seen
         np.testing.assert_allclose(found[k + 1], difference, atol=within * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("lanes", [None, 2])
+def test_a_table_of_all_slopes_gives_what_branches_give(lanes: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, where a branch waits for the host."""
+    plan = setup(linear_plant.model(), linear_plant.recording(), (), [linear_plant.LOAD], 2)
+    y, ok, u, start, spread = (jnp.moveaxis(a[:4], 0, -1) for a in plan.windows.arrays)
+    n_p, points = plan.coordinates.sizes[0], y.shape[-1]
+    p = jnp.repeat(jnp.asarray(plan.augmented.neutral)[:, None], points, axis=1)
+    noise = Noise(jnp.full((len(y[0]), points), 0.1), jnp.full((len(start), points), 0.1))
+    rows = jnp.arange(n_p + 1) if lanes is None else jnp.stack([jnp.arange(n_p + 1), jnp.arange(n_p + 1)[::-1]], axis=1)
+    track, held = plan.rule.track(p, noise, y, ok, u, start, spread)
+    on_cpu = plan.rule.pushes(p, rows, track, held, u)
+    monkeypatch.setattr(tangents, "current_device", lambda: SimpleNamespace(platform="gpu"))
+    on_gpu = plan.rule.pushes(p, rows, track, held, u)
+    assert float(jnp.abs(on_cpu[1].state).max()) > 0
+    for a, b in zip(jax.tree.leaves(on_cpu), jax.tree.leaves(on_gpu), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)

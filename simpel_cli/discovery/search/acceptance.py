@@ -129,7 +129,8 @@ def with_interactions(
 
 
 def _report_gate(what: str, judged: Gate, terminal: Terminal, *, out: bool) -> None:
-    why = "" if judged.passed else f", the error of {judged.grows[0]} grows" if judged.grows else ", not certain"
+    instead = f", the error of {judged.falls[0]} falls" if judged.falls and judged.low <= 0 else ""
+    why = instead if judged.passed else f", the error of {judged.grows[0]} grows" if judged.grows else ", not certain"
     terminal.line(
         f"{what}: held-out gain {judged.gain:.0f} ({judged.low:.0f}..{judged.high:.0f}) nats"
         f" by {judged.unit}{why}{': not accepted' if out else ''}",

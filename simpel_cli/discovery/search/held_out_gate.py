@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, gain_interval, reduction_interval
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
@@ -19,6 +19,7 @@ LEAST_BLOCKS = 20
 LEAST_OF_BLOCK = 8  # rows
 ORDINARY = 0.9  # of the blocks: larger gains and losses than these have are odd
 MOST_FOLDS = 5
+LEAST_PARTS = 8  # of which an error that falls can pass an effect
 TOLERATED = {"one_step": 0.1, "ahead": 0.02, "free": 0.02}  # of an error: so much it may grow
 SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
 RUNAWAY = 1e4  # nats that a window costs a model that ran away in it
@@ -36,8 +37,9 @@ class Gate(NamedTuple):
         harm: whether an error grows: of any channel, at any horizon, certainly and by more than `TOLERATED`. A model that
             predicts the next row better and all others worse has learnt to follow. One row ahead the likelihood judges, too;
             there a model that follows what it cannot explain has small errors, and may lose some of that.
-        passed: whether there is no harm, and the lower end is positive or, where the gain is, an error further ahead than one
-            row certainly falls by more than `TOLERATED`. What acts seldom, as an overflow does, gains much in few parts.
+        passed: whether there is no harm, and the lower end is positive or, where the gain is what evidence would have to be,
+            an error further ahead than one row certainly falls by more than `TOLERATED`, in `LEAST_PARTS` or more. What acts
+            seldom, as an overflow does, gains much in few parts.
         grows: which errors grow, in words.
         falls: which errors further ahead fall so.
     """
@@ -234,10 +236,12 @@ def _judged(
     low, high = gain_interval(per_group, np.random.default_rng(1))
     of = groups if runs is None else {AHEAD["free"]: runs, "": groups}
     grows = growing(before, after, measured, of)
-    further = [words for words in before if words != AHEAD["one_step"]]
+    # of a few parts resampling says little: it may pass nothing
+    parts = {words: len(np.unique(of.get(words, groups) if isinstance(of, dict) else of)) for words in before}
+    further = [words for words in before if words != AHEAD["one_step"] and parts[words] >= LEAST_PARTS]
     falls = growing({words: after[words] for words in further}, before, measured, of)
     total = float(gains.sum())
-    helps = bool(low > 0) or (total > 0 and bool(falls))
+    helps = bool(low > 0) or (total > ACCEPT and bool(falls))
     return Gate(total, low, high, unit, bool(grows), helps and not grows, grows, falls)
 
 

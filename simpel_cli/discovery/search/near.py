@@ -1,4 +1,7 @@
-"""Whether a model's errors ahead are near the measurement noise: farther than that something is missing."""
+"""Whether a model's errors ahead are near the measurement noise: farther than that something is missing.
+
+Where states are unstable, errors ahead are large though nothing is missing; then there is no noise of the process.
+"""
 
 import numpy as np
 
@@ -6,11 +9,27 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
 
 NEAR = 3.0  # times the measurement noise: errors so small are near the floor
+QUIET = 0.45  # of the range of log q: a hundredth of a typical rate
 
 
 def far(search: Search, assessor: Assessor, trial: Trial) -> bool:
-    """Whether the error of any channel some rows ahead, in the measurements of the search, is far above its noise."""
-    error = rmse(assessor(trial.optimum.z, search.plan.windows).ahead)
-    n_p, n_r, _ = search.plan.coordinates.sizes
+    """Whether noise of the process is needed, and the error of a channel some rows ahead far above the noise.
+
+    Args:
+        search: whose measurements are looked at.
+        assessor: of errors ahead.
+        trial: the model.
+    """
+    n_p, n_r, n_q = search.plan.coordinates.sizes
+    if (trial.optimum.z[n_p + n_r : n_p + n_r + n_q] < QUIET).all():
+        return False
+    windows = search.plan.windows
+    found = assessor(trial.optimum.z, windows)
+    if not np.isfinite(np.asarray(found.track.innovation)[windows.ok > 0]).all():  # it ran away
+        return True
+    known = np.isfinite(found.ahead).any(axis=(0, 1))
+    if not known.any():  # windows without a row so far ahead
+        return False
+    error = rmse(found.ahead[..., known])
     noise = np.array([search.plan.coordinates.value(i, float(trial.optimum.z[i])) for i in range(n_p, n_p + n_r)])
-    return not bool(np.all(error <= NEAR * noise))
+    return bool(np.any(error > NEAR * noise[known]))

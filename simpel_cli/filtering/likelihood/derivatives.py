@@ -31,10 +31,14 @@ class Differentiated(NamedTuple):
 
     Args:
         slopes: (x, u, p) -> Slopes, where x, u and p are (nx, ...), (nu, ...) and (dp, ...) at the same points.
+        every: (x, u, p) -> derivatives in all parameters that move the results, and zeros.
+        place: row of p -> its place among them.
         along: (row, x, u, p) -> derivative in p[row], (n, ...); one beyond the last row of p: 0. p may lack axes of the points.
     """
 
     slopes: Callable[[Array, Array, Array], Slopes]
+    every: Callable[[Array, Array, Array], Float[Array, "J n ..."]]
+    place: Callable[[Int[Array, "..."]], Int[Array, "..."]]
     along: Callable[[Int[Array, ""], Array, Array, Array], Float[Array, "n ..."]]
 
 
@@ -98,11 +102,18 @@ def differentiated(augmented: Augmented, of: int, *, slope: bool = False) -> Dif
     place = np.full(p.numel() + 1, len(moving))
     place[moving] = np.arange(len(moving))
 
-    def along(row: Array, x: Array, u: Array, p: Array) -> Array:
-        nothing = lambda x, u, p: jnp.zeros((n, *x.shape[1:]), x.dtype)  # noqa: E731
-        return jax.lax.switch(jnp.asarray(place)[row], [*branches, nothing], x, u, p)
+    branches.append(lambda x, u, p: jnp.zeros((n, *x.shape[1:]), x.dtype))
 
-    return Differentiated(slopes, along)
+    def places(rows: Array) -> Array:
+        return jnp.asarray(place)[rows]
+
+    def every(x: Array, u: Array, p: Array) -> Array:
+        return jnp.stack([branch(x, u, p) for branch in branches])
+
+    def along(row: Array, x: Array, u: Array, p: Array) -> Array:
+        return jax.lax.switch(places(row), branches, x, u, p)
+
+    return Differentiated(slopes, every, places, along)
 
 
 def _column(result: list[casadi.SX], arguments: tuple[casadi.SX, ...]) -> Callable[[Array, Array, Array], Array]:

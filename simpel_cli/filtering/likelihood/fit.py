@@ -111,19 +111,22 @@ class Fitter:
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
         self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: bool = False) -> list[Optimum]:
+    def __call__(
+        self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: Sequence[bool] | None = None
+    ) -> list[Optimum]:
         """Fit every hypothesis with `most` iterations.
 
         Args:
             hypotheses: to fit.
             most: iterations.
-            racing: only the best count: one that lies `BEHIND` the best, and would at its pace of the last round need more
-                than `LAPS` rounds to catch up, ends there.
+            racing: of two kinds, which each is; of either the best count: what lies `BEHIND` the best of its kind, and would
+                at its pace of the last round need more than `LAPS` rounds to catch up, ends there.
         """
         if not hypotheses:
             return []
         state = self._begin(hypotheses)
         waiting = np.arange(len(hypotheses))
+        kinds = np.zeros(len(hypotheses), bool) if racing is None else np.array(racing, bool)
         while waiting.size:
             before = state.loss[waiting]
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
@@ -135,8 +138,9 @@ class Fitter:
             gained = np.subtract(before, state.loss[waiting], where=both, out=np.full(len(waiting), np.inf))
             # a step that helped with the damping of a refusal is short, whatever is left to gain
             walks = both & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
-            behind = np.where(both, state.loss[waiting], 0.0) - state.loss.min()
-            lost = (behind > BEHIND) & (behind > LAPS * gained) if racing else np.zeros(len(waiting), bool)
+            best = np.array([state.loss[kinds == kind].min(initial=np.inf) for kind in (False, True)])
+            behind = np.where(both, state.loss[waiting], 0.0) - best[kinds[waiting].astype(int)]
+            lost = (behind > BEHIND) & (behind > LAPS * gained) & (racing is not None)
             ended = state.done[waiting] | (walks & ((gained < SLOW) | lost)) | (state.iteration[waiting] >= most)
             waiting = waiting[~ended]
         return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]

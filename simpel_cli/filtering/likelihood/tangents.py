@@ -29,6 +29,7 @@ from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, pushed
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
+from simpel_cli.runs.settings import current_device
 
 SMALL = 3  # states of a model whose covariance follows the parameters
 POINTS = 8192  # at which derivatives are worked out at once: more do not fit a cache
@@ -356,6 +357,8 @@ def _along_rows(of: Differentiated, rows: Array, x: Array, u: Array, p: Array) -
 
     The points of a part share their parameters.
     """
+    if current_device().platform != "cpu":  # there a branch would wait for the host
+        return _picked(of.every(x, u, p), of.place(rows))
     if rows.ndim == 1:
         return jax.lax.map(lambda row: of.along(row, x, u, p), rows)
     parts = rows.shape[1]
@@ -369,7 +372,16 @@ def _along_rows(of: Differentiated, rows: Array, x: Array, u: Array, p: Array) -
     which = jnp.broadcast_to(jnp.arange(parts), rows.shape)
     found = jax.lax.map(one, (rows.ravel(), which.ravel()))
     found = jnp.moveaxis(found.reshape(*rows.shape, *found.shape[1:]), 1, -2)
-    return found.reshape(*found.shape[:-2], -1)
+    return found.reshape(*found.shape[:-2], x.shape[-1])
+
+
+def _picked(table: Array, rows: Array) -> Array:
+    """Return the entries of a table, (J, n, ...), that stand in rows, (D,), or (D, L), each for a part of the last axis."""
+    if rows.ndim == 1:
+        return table[rows]
+    cut = table.reshape(*table.shape[:-1], rows.shape[1], table.shape[-1] // rows.shape[1])
+    found = jax.vmap(lambda part, row: part[row], in_axes=(-2, 1), out_axes=-2)(cut, rows)
+    return found.reshape(*found.shape[:-2], table.shape[-1])
 
 
 def _stages_of(count: int) -> Array:

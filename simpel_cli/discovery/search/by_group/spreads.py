@@ -56,7 +56,9 @@ class Spreading:
         self.fitter, self.spreads = fitter, spreads
         self.width, self.coordinates = fitter.width, fitter.coordinates
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: bool = False) -> list[Optimum]:
+    def __call__(
+        self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: Sequence[bool] | None = None
+    ) -> list[Optimum]:
         """Fit every hypothesis; one that leaves windows out, or of a single iteration, keeps its spreads."""
         found = self.fitter(hypotheses, most, racing=racing)
         if most < MOST:
