@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.filtering.likelihood import tangents
+from simpel_cli.filtering.likelihood import pushes
 from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression
@@ -119,7 +119,7 @@ def test_a_table_of_all_slopes_gives_what_branches_give(lanes: int | None, monke
     rows = jnp.arange(n_p + 1) if lanes is None else jnp.stack([jnp.arange(n_p + 1), jnp.arange(n_p + 1)[::-1]], axis=1)
     track, held = plan.rule.track(p, noise, y, ok, u, start, spread)
     on_cpu = plan.rule.pushes(p, rows, track, held, u)
-    monkeypatch.setattr(tangents, "current_device", lambda: SimpleNamespace(platform="gpu"))
+    monkeypatch.setattr(pushes, "current_device", lambda: SimpleNamespace(platform="gpu"))
     on_gpu = plan.rule.pushes(p, rows, track, held, u)
     assert float(jnp.abs(on_cpu[1].state).max()) > 0
     for a, b in zip(jax.tree.leaves(on_cpu), jax.tree.leaves(on_gpu), strict=True):

@@ -33,9 +33,10 @@ from simpel_cli.filtering.likelihood.clock import at_row, early_of, pace_of
 from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
+from simpel_cli.filtering.likelihood.pushes import Timing, pushes_of
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
-from simpel_cli.filtering.likelihood.tangents import Timing, pushes_of, slopes_of
+from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT, SENSOR_DELAY, SENSOR_LAG
 

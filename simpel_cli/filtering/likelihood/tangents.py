@@ -1,7 +1,7 @@
 """Derivatives of innovations and variances along a track of the filter: in the levels of noise, and in parameters.
 
 Along a known track all that moves is linear. What one unit of a parameter adds to rates and readings is worked out at all
-rows at once, at the stages of the integrator (`pushes`). What that leads to is a recursion of small products (`slopes`),
+rows at once (`pushes.py`). What that leads to is a recursion of small products (`slopes`),
 
     de = -(H d + reading),             d+ = d + K de + dP+ H' e/R,            d_next  = F d+ + state
     dP+ = (I - K H) dP (I - K H)' + K dR K',    dP_next = F dP+ F' + dF P+ F' + F P+ dF' + dQ
@@ -14,7 +14,7 @@ Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (t
 (1999), System identification, ch. 7.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -22,35 +22,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from simpel_cli.filtering.likelihood.augmented import Augmented
-from simpel_cli.filtering.likelihood.clock import chosen, early_of
+from simpel_cli.filtering.likelihood.clock import early_of
 from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
-from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
+from simpel_cli.filtering.likelihood.pushes import SMALL, Timing
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo, pushed
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
-from simpel_cli.runs.settings import current_device
-
-SMALL = 3  # states of a model whose covariance follows the parameters
-POINTS = 8192  # at which derivatives are worked out at once: more do not fit a cache
-
-
-class Timing(NamedTuple):
-    """When inputs and readings of an augmented model act.
-
-    Args:
-        dt: s.
-        substeps: Runge-Kutta steps per row.
-        inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu, ...).
-        of_inputs: rows of p that say when an input arrives.
-        late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
-    """
-
-    dt: float
-    substeps: int
-    inputs: Callable[[Array, Array], Array]
-    of_inputs: Sequence[int]
-    late_by: Callable[[Array], tuple[Array, Array]] | None
 
 
 class _Rows(NamedTuple):
@@ -61,94 +39,6 @@ class _Rows(NamedTuple):
     counted: tuple[Array, Array]
     ways: Ways
     step: Array | None
-
-
-def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:
-    """Return `pushes` of a filter (see `Filter`)."""
-    nx, nu = len(augmented.model.states), len(augmented.model.inputs)
-    rates, sensors = differentiated(augmented, RATES), differentiated(augmented, SENSORS)
-    bend = differentiated(augmented, RATES, slope=True) if nx <= SMALL else None
-    dt, substeps, late_by = timing.dt, timing.substeps, timing.late_by
-
-    def pushes(p: Array, rows: Array, at: Track, held: Held, u: Array) -> tuple[Ways, Pushes]:
-        sure = sure_of(at.variance)
-        units = jax.vmap(lambda row: _unit(p, row))(_at_each(rows, p))
-        moved = moved_before = None
-        asked = jnp.asarray(False)
-        if timing.of_inputs:
-            asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
-            moved = jnp.moveaxis(
-                _if(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
-            )
-            moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
-        at_rows = lambda a: jnp.expand_dims(a, a.ndim - p.ndim + 1)  # noqa: E731
-        late = None if late_by is None else jax.tree.map(at_rows, (late_by(p), _along(late_by, p, units)))
-        before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
-
-        def of(part: tuple[Any, ...]) -> tuple[Ways, Pushes]:
-            """Rows are points like others: their axis goes in front of those of the points, and back."""
-            found = _of_rows(
-                at_rows(p), rows, asked, late, sure, *jax.tree.map(lambda a: jnp.moveaxis(a, 0, -p.ndim), part)
-            )
-            return jax.tree.map(lambda a: jnp.moveaxis(a, -p.ndim, 0), found)
-
-        size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
-        ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
-        if found.bent is not None:
-            assert bend is not None
-            begin = at.predicted[0], before[0], None if moved_before is None else moved_before[0]
-            start = _pushed(bend, p, rows, *begin, asked)
-            found = found._replace(bent=jnp.concatenate([start.reshape(1, *found.bent.shape[1:]), found.bent[:-1]]))
-        return ways, found
-
-    def _of_rows(
-        p: Array, rows: Array, asked: Array, late: Any, sure: Array, predicted: Array, held: Held, before: Array, moved: Any,
-        moved_before: Any,
-    ) -> tuple[Ways, Pushes]:  # fmt: skip
-        """Do so for rows, the first axis of the points; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
-        u = held.u[:, _stages_of(held.u.shape[1])]  # (substeps, 3, nu, ...)
-        x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
-        moved_s = None
-        if moved is not None:
-            moved_s = jnp.moveaxis(moved[:, :, _stages_of(moved.shape[2])], 3, 1)
-        push = _pushed(rates, p, rows, x_s, u_s, moved_s, asked)
-        by_x = jnp.moveaxis(held.stage_x, (2, 3), (0, 1))
-        h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
-        state = jax.vmap(lambda g: _composed(by_x, g, h, sure))(push)
-
-        first_of = lambda a: None if a is None else a[:, :, 0, 0]  # noqa: E731
-        early = early_of(held.u[0, 0], nu)
-        first = now = end = push_first = push_now = push_end = None
-        if late is not None or early is not None:
-            begin = predicted, u_s[:, 0, 0]
-            push_now = _pushed(rates, p, rows, *begin, first_of(moved_s), asked)
-            first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
-            push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
-        reading = _pushed(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s), asked)
-        if early is not None:
-            then = _pushed(sensors, p, rows, predicted, before, moved_before, asked)
-            reading = jax.vmap(lambda a, b: chosen(early, a, b))(then, reading)
-        if late is not None:
-
-            def shown(late: tuple[Array, Array]) -> Array:
-                assert held.rate is not None
-                assert held.jumps is not None
-                return jnp.sum(held.prompt * back(*late, held.rate, held.rate_x), axis=1) + echo(*late, held.jumps, dt)
-
-            reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
-
-        turn = push_turn = push_bent = None
-        if bend is not None:
-            moved_ends = None if moved_s is None else jax.vmap(_ends)(moved_s)
-            turned = _pushed(bend, p, rows, _ends(x_s), _ends(u_s), moved_ends, asked)
-            squares = turned.reshape(len(rows), nx, nx, *turned.shape[2:])
-            turn = _slopes(bend, p, _ends(x_s), _ends(u_s)).by_x
-            turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
-            push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
-            push_bent = squares[:, :, :, 1] if early is not None else None
-        return Ways(first, now, end, turn), Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
-
-    return pushes
 
 
 class _Moved(NamedTuple):
@@ -320,135 +210,6 @@ def _shifted(pace: Array, first: float) -> Array:
     return jnp.concatenate([jnp.full_like(pace[:1], first), pace[:-1]])
 
 
-def _slopes(of: Differentiated, p: Array, x: Array, u: Array) -> Slopes:
-    """Slopes at points (nx, ...), (nu, ...), the last axes of which p has."""
-    return of.slopes(x, u, jnp.broadcast_to(_beside(p, x), (len(p), *x.shape[1:])))
-
-
-def _pushed(of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved: Array | None, asked: Array) -> Array:
-    """Return what every direction adds, (D, n, ...), at such points.
-
-    Args:
-        of: the function.
-        p: parameters.
-        rows: directions (see `Filter`).
-        x: states.
-        u: inputs.
-        moved: (D, nu, ...) how these change; None: they do not.
-        asked: whether they do in any direction.
-    """
-    found = _along_rows(of, rows, x, u, _beside(p, x))
-    if moved is None:
-        return found
-
-    def by_inputs() -> Array:
-        by_u = _slopes(of, p, x, u).by_u
-        return jax.vmap(lambda d: applied(by_u, d))(moved)
-
-    return found + _if(asked, by_inputs)
-
-
-def _beside(p: Array, x: Array) -> Array:
-    return p.reshape(len(p), *(1,) * (x.ndim - p.ndim), *p.shape[1:])
-
-
-def _along_rows(of: Differentiated, rows: Array, x: Array, u: Array, p: Array) -> Array:
-    """Derivatives in p[row] for each of rows, (D, n, ...), or (D, L) of which each is for a part of the last axis.
-
-    The points of a part share their parameters.
-    """
-    if current_device().platform != "cpu":  # there a branch would wait for the host
-        return _picked(of.every(x, u, p), of.place(rows))
-    if rows.ndim == 1:
-        return jax.lax.map(lambda row: of.along(row, x, u, p), rows)
-    parts = rows.shape[1]
-    given = [jnp.moveaxis(a.reshape(*a.shape[:-1], parts, a.shape[-1] // parts), -2, 0) for a in (x, u, p)]
-    given[2] = given[2][..., :1]  # numbers: what is made of them alone is made once
-
-    def one(at: tuple[Array, Array]) -> Array:
-        row, part = at
-        return of.along(row, *(jax.lax.dynamic_index_in_dim(a, part, keepdims=False) for a in given))
-
-    which = jnp.broadcast_to(jnp.arange(parts), rows.shape)
-    found = jax.lax.map(one, (rows.ravel(), which.ravel()))
-    found = jnp.moveaxis(found.reshape(*rows.shape, *found.shape[1:]), 1, -2)
-    return found.reshape(*found.shape[:-2], x.shape[-1])
-
-
-def _picked(table: Array, rows: Array) -> Array:
-    """Return the entries of a table, (J, n, ...), that stand in rows, (D,), or (D, L), each for a part of the last axis."""
-    if rows.ndim == 1:
-        return table[rows]
-    cut = table.reshape(*table.shape[:-1], rows.shape[1], table.shape[-1] // rows.shape[1])
-    found = jax.vmap(lambda part, row: part[row], in_axes=(-2, 1), out_axes=-2)(cut, rows)
-    return found.reshape(*found.shape[:-2], table.shape[-1])
-
-
-def _stages_of(count: int) -> Array:
-    """Return where the beginning, the middle and the end of a substep stand among its inputs."""
-    return jnp.array([0, count // 2, count - 1])
-
-
-def _ends(a: Array) -> Array:
-    """Return the beginning and the end of a row; a: (n, substeps, 3, ...)."""
-    return jnp.stack([a[:, 0, 0], a[:, -1, -1]], axis=1)
-
-
 def _turned_back(early: Array, prompt: Array, rate_x: Array, bent: Array) -> Array:
     """How the slope of what was read before its row changes as that of the rates does."""
     return jax.jvp(lambda a: slope_back(early, prompt, a), (rate_x,), (bent,))[1]
-
-
-def _composed(by_x: Array, push: Array, h: Array | float, sure: Array) -> Array:
-    """Return what a push of the rates, (nx, substeps, 3, ...), leads to at the end of the row: the integrator's derivative."""
-
-    def step(moved: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
-        a, g = now
-
-        def rate(k: int, x: Array) -> Array:
-            return apart(sure, applied, a[:, :, k], x) + g[:, k]
-
-        k1 = rate(0, moved)
-        k2 = rate(1, moved + h / 2 * k1)
-        k3 = rate(1, moved + h / 2 * k2)
-        k4 = rate(2, moved + h * k3)
-        return moved + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
-
-    start = jnp.zeros((push.shape[0], *push.shape[3:]), push.dtype)
-    return jax.lax.scan(step, start, (jnp.moveaxis(by_x, 2, 0), jnp.moveaxis(push, 1, 0)))[0]
-
-
-def _at_each(rows: Array, p: Array) -> Array:
-    """Return the row of every direction at every point, (D, ...)."""
-    if rows.ndim == 1:
-        return jnp.broadcast_to(rows.reshape(-1, *(1,) * (p.ndim - 1)), (len(rows), *p.shape[1:]))
-    return jnp.repeat(rows, p.shape[-1] // rows.shape[1], axis=1)
-
-
-def _unit(p: Array, row: Array) -> Array:
-    """Return the direction in which one parameter moves, (dp, ...); row: (...)."""
-    return (jnp.arange(len(p)).reshape(-1, *(1,) * row.ndim) == row[None]).astype(p.dtype)
-
-
-def _along(function: Callable[[Array], Any], p: Array, units: Array) -> Any:
-    """Derivatives of a function of the parameters in every direction."""
-    return jax.vmap(lambda unit: jax.jvp(function, (p,), (unit,))[1])(units)
-
-
-def _if(asked: Array, worked_out: Callable[[], Array]) -> Array:
-    """Zeros where it is not asked for."""
-    shape = jax.eval_shape(worked_out)
-    return jax.lax.cond(asked, worked_out, lambda: jnp.zeros(shape.shape, shape.dtype))
-
-
-def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
-    """Apply a function of rows, which lead, to so many at once."""
-    count = len(jax.tree.leaves(rows)[0])
-    parts = -(-count // size)
-    if parts == 1:
-        return function(rows)
-    size = -(-count // parts)
-    filled = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], parts * size - count, axis=0)]), rows)
-    apart = jax.tree.map(lambda a: a.reshape(parts, size, *a.shape[1:]), filled)
-    found = jax.lax.map(function, apart)
-    return jax.tree.map(lambda a: a.reshape(parts * size, *a.shape[2:])[:count], found)
