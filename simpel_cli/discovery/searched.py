@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from simpel_cli.data import Recording, read
-from simpel_cli.discovery.search.acceptance import accepted, with_interactions
+from simpel_cli.discovery.search.acceptance import accepted, proposed, with_interactions
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
@@ -277,6 +277,20 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
         terminal.line("searching once more", "groups")
 
 
+def _chosen_in(
+    found: Calibrated, assessor: Assessor, options: Discovery, terminal: Terminal,
+    wider: Callable[[Search, Trial], Wider | None],
+) -> tuple[Selection, list[Gate]] | Wider:  # fmt: skip
+    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow."""
+    proposal = proposed(found.search, assessor, found.base, options)
+    if (ends := wider(found.search, proposal.chosen)) is not None:
+        return ends
+    judged, gates = accepted(found.search, assessor, proposal, terminal)
+    left = judged.chosen.terms != proposal.chosen.terms  # what was refused may have made up for a range
+    ends = wider(found.search, judged.chosen) if left else None
+    return (judged, gates) if ends is None else ends
+
+
 def _with(
     ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
 ) -> Searched | Wider | list[Grouping]:
@@ -309,16 +323,13 @@ def _with(
         found.search.budget = ground.budget
         return assessor, found
 
-    def accept(found: Calibrated) -> tuple[Selection, list[Gate]] | Wider:
-        return accepted(found.search, assessor, found.base, options, terminal, ends=wider)
-
     assessor, found = begun_in(plan)
     if (ends := wider(found.search, found.base)) is not None:
         return ends
-    judged = accept(found)
-    if isinstance(judged, Wider):
-        return judged
-    selection, gates = judged
+    outcome = _chosen_in(found, assessor, options, terminal, wider)
+    if isinstance(outcome, Wider):
+        return outcome
+    selection, gates = outcome
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
@@ -326,12 +337,10 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan = attach(saying(model, between_rows), kept=kept)
         assessor, found = begun_in(plan)
-        judged = accept(found)
-        if isinstance(judged, Wider):
-            return judged
-        selection, gates = judged
-    if (ends := wider(found.search, selection.chosen)) is not None:
-        return ends
+        outcome = _chosen_in(found, assessor, options, terminal, wider)
+        if isinstance(outcome, Wider):
+            return outcome
+        selection, gates = outcome
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
@@ -343,9 +352,8 @@ def _with(
     if heavy is not None:
         found = heavy
         found.search.budget = ground.budget
-        judged = accepted(found.search, assessor, found.base, options, terminal)
-        assert not isinstance(judged, Wider)  # of ranges it is not asked
-        selection, gates = judged
+        selection = proposed(found.search, assessor, found.base, options)
+        selection, gates = accepted(found.search, assessor, selection, terminal)
     search, windows = found.search, found.test
     by_simulations = None
     if options.simulations and not ground.budget.over("a search by simulations"):

@@ -8,10 +8,11 @@ import pytest
 from test_ranges import cart, searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.near import far
+from simpel_cli.discovery.search.near import QUIET, far
 from simpel_cli.discovery.search.selection import Selection, select, widely
 from simpel_cli.discovery.search.trials import ANYWHERE, Search
 from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.setup import Q_BOUNDS
 from simulators.effects import Expression
 
 FORCE, PLACE, GAIN, DT, FINE = 4.0, 6.0, 1.3, 0.1, 50
@@ -104,3 +105,10 @@ def test_a_model_that_runs_away_is_far_and_a_channel_without_errors_ahead_says_n
     assert unwrap(far)(search, shown, chosen.chosen)
     innovation[0, -1, 0], ahead[..., 0] = 0.0, 1.0
     assert unwrap(far)(search, shown, chosen.chosen)
+    n_p, n_r, _ = search.plan.coordinates.sizes
+    for rates, expected in ((1.1 * QUIET, True), (0.9 * QUIET, False)):  # an unstable state: far, and nothing missing
+        z = chosen.chosen.optimum.z.copy()
+        level = np.array(Q_BOUNDS)
+        z[n_p + n_r : -1] = np.log(rates / level[0]) / np.log(level[1] / level[0])
+        trial = chosen.chosen._replace(optimum=chosen.chosen.optimum._replace(z=z))
+        assert unwrap(far)(search, shown, trial) == expected

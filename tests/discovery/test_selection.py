@@ -12,8 +12,9 @@ from test_aliases import searched
 from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
+from simpel_cli.discovery import searched as searched_module
 from simpel_cli.discovery.search import acceptance, calibration
-from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection
+from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, proposed
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
@@ -21,6 +22,7 @@ from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.selection import cut, further, select
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
+from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.measurements.cleaning import Cleaned
@@ -368,28 +370,54 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
 
     count = iter(range(100))
     monkeypatch.setattr(acceptance, "gated_selection", gated)
-    monkeypatch.setattr(acceptance, "far", lambda *_: False)
-    monkeypatch.setattr(acceptance, "select", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=())))
     monkeypatch.setattr(acceptance, "further", lambda *_: SimpleNamespace(chosen=SimpleNamespace(terms=(next(count),))))
     none: Any = None
-    options: Any = SimpleNamespace(beginnings=0)
     search: Any = SimpleNamespace(banned=set(), budget=Budget())
-    selection, gates = unwrap(accepted)(search, none, none, options, none)
+    first: Any = SimpleNamespace(chosen=SimpleNamespace(terms=()))
+    selection, gates = unwrap(accepted)(search, none, first, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]
 
 
-def test_ranges_are_asked_before_anything_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceptance, "gated_selection", pytest.fail)
-    monkeypatch.setattr(acceptance, "far", lambda *_: True)
-    first, second = (SimpleNamespace(chosen=SimpleNamespace(terms=terms)) for terms in ((), (1,)))
-    monkeypatch.setattr(acceptance, "select", lambda *_: first)
-    monkeypatch.setattr(acceptance, "widely", lambda _, found: second if found is first else None)
+def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     none: Any = None
-    wider = Wider({"k": (0.0, 2.0)}, 9.0)
-    ends = lambda _, trial: wider if trial is second.chosen else None  # noqa: E731
+    first = SimpleNamespace(chosen=1)
+    monkeypatch.setattr(acceptance, "select", lambda *_: first)
+    monkeypatch.setattr(acceptance, "widely", lambda _, found: (found, "anywhere"))
+    monkeypatch.setattr(acceptance, "far", lambda _, __, chosen: chosen == 1)
     options: Any = SimpleNamespace(beginnings=0)
-    assert unwrap(accepted)(none, none, none, options, none, (), ends) is wider
+    assert unwrap(proposed)(none, none, none, options) == (first, "anywhere")
+    monkeypatch.setattr(acceptance, "far", lambda *_: False)
+    assert unwrap(proposed)(none, none, none, options) is first
+
+
+@pytest.mark.parametrize(
+    ("asks", "kept", "questions"),
+    [("proposed", 1, ["proposed"]), ("judged", 0, ["proposed", "judged"]), ("", 1, ["proposed"])],
+)
+def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refused(
+    asks: str, kept: int, questions: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = lambda name, count: SimpleNamespace(name=name, terms=tuple(range(count)))  # noqa: E731
+    proposal, judged = (SimpleNamespace(chosen=model(name, n)) for name, n in (("proposed", 1), ("judged", kept)))
+    wider, asked_of, judgements = Wider({"k": (0.0, 2.0)}, 9.0), list[str](), list[object]()
+
+    def ends(_: Any, chosen: Any) -> Wider | None:
+        asked_of.append(chosen.name)
+        return wider if chosen.name == asks else None
+
+    def accept(_: Any, __: Any, selection: Any, ___: Any) -> tuple[Any, list[Any]]:
+        judgements.append(selection)
+        return judged, []
+
+    monkeypatch.setattr(searched_module, "proposed", lambda *_: proposal)
+    monkeypatch.setattr(searched_module, "accepted", accept)
+    none: Any = None
+    found: Any = SimpleNamespace(search=none, base=none)
+    outcome = unwrap(_chosen_in)(found, none, none, none, ends)
+    assert outcome is wider if asks else outcome == (judged, [])
+    assert asked_of == questions
+    assert judgements == ([] if asks == "proposed" else [proposal])
 
 
 @pytest.mark.parametrize(("formula", "stays"), [(96.0, True), (85.0, False)])

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.near import far
-from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select, widely
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -20,33 +19,26 @@ STRONG = (
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
 
-def accepted(
-    search: Search,
-    assessor: Assessor,
-    base: Trial,
-    options: Discovery,
-    terminal: Terminal,
-    begun: tuple[Trial, ...] = (),
-    ends: Callable[[Search, Trial], Wider | None] = lambda *_: None,
-) -> tuple[Selection, list[Gate]] | Wider:
-    """Search, and go on without an effect that does harm: another one may be what it stood for.
-
-    Where errors ahead are far above the noise even so, effects may begin anywhere in their ranges.
+def proposed(
+    search: Search, assessor: Assessor, base: Trial, options: Discovery, begun: tuple[Trial, ...] = ()
+) -> Selection:
+    """Search by evidence; where errors ahead stay far above the noise, effects begin anywhere in their ranges, too.
 
     Args:
         search: over sets of effects.
         assessor: of errors ahead.
         base: the calibrated simulator.
         options: of the search.
-        terminal: takes lines.
         begun: as of `select`.
-        ends: returns the wider ranges that a model asks for: nothing is judged on held-out episodes beside wrong ones.
     """
     selection = select(search, base, options.beginnings, begun)
-    if far(search, assessor, selection.chosen):
-        selection = widely(search, selection)
-    if (wider := ends(search, selection.chosen)) is not None:
-        return wider
+    return widely(search, selection) if far(search, assessor, selection.chosen) else selection
+
+
+def accepted(
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
+) -> tuple[Selection, list[Gate]]:
+    """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for."""
     for attempt in range(MOST_SEARCHES):
         selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
         last = attempt == MOST_SEARCHES - 1 or (

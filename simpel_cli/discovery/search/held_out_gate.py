@@ -234,11 +234,10 @@ def _judged(
     """Judge gains (W,) and errors without and with an effect; groups: (W,), and of free runs `runs` where it is given."""
     per_group = np.array([gains[groups == name].sum() for name in np.unique(groups)])
     low, high = gain_interval(per_group, np.random.default_rng(1))
-    of = groups if runs is None else {AHEAD["free"]: runs, "": groups}
+    of = dict.fromkeys(before, groups) | ({} if runs is None else {AHEAD["free"]: runs})
     grows = growing(before, after, measured, of)
     # of a few parts resampling says little: it may pass nothing
-    parts = {words: len(np.unique(of.get(words, groups) if isinstance(of, dict) else of)) for words in before}
-    further = [words for words in before if words != AHEAD["one_step"] and parts[words] >= LEAST_PARTS]
+    further = [w for w in before if w != AHEAD["one_step"] and len(np.unique(of[w])) >= LEAST_PARTS]
     falls = growing({words: after[words] for words in further}, before, measured, of)
     total = float(gains.sum())
     helps = bool(low > 0) or (total > ACCEPT and bool(falls))
@@ -259,16 +258,14 @@ def growing(
         before: errors of every measured channel without an effect, at every horizon.
         after: with it.
         measured: names of the channels, ny.
-        groups: of which part each window is, (W,); or by horizon, "" for all others.
+        groups: of which part each window is, (W,); or by horizon.
     """
-    of = groups if isinstance(groups, Mapping) else {"": groups}
+    of = groups if isinstance(groups, Mapping) else dict.fromkeys(before, groups)
     random = np.random.default_rng(1)
     found: dict[str, bool] = {}
     told = sum(int(np.isfinite(e).any(axis=(0, 1)).sum()) for e in before.values())
     most = {AHEAD[name]: 1 / (1 + tolerated) for name, tolerated in TOLERATED.items()}
     for words, error in before.items():
-        best = reduction_interval(
-            error, after[words], of.get(words, of[""]), random, level=1 - 2 * SURE / max(told, 1)
-        )[1]
+        best = reduction_interval(error, after[words], of[words], random, level=1 - 2 * SURE / max(told, 1))[1]
         found |= {f"{name} {words}": value < most[words] for name, value in zip(measured, best, strict=False)}
     return tuple(words for words, grows in found.items() if grows)

@@ -7,9 +7,10 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
+from simpel_cli.filtering.setup import Q_BOUNDS
 
 NEAR = 3.0  # times the measurement noise: errors so small are near the floor
-QUIET = 0.45  # of the range of log q: a hundredth of a typical rate
+QUIET = 0.01  # typical rates: so little noise of the process makes up for nothing
 
 
 def far(search: Search, assessor: Assessor, trial: Trial) -> bool:
@@ -20,16 +21,17 @@ def far(search: Search, assessor: Assessor, trial: Trial) -> bool:
         assessor: of errors ahead.
         trial: the model.
     """
-    n_p, n_r, n_q = search.plan.coordinates.sizes
-    if (trial.optimum.z[n_p + n_r : n_p + n_r + n_q] < QUIET).all():
+    coordinates, z = search.plan.coordinates, trial.optimum.z
+    n_p, n_r, n_q = coordinates.sizes
+    process = range(n_p + n_r, n_p + n_r + n_q)
+    if all(coordinates.value(i, float(z[i])) < coordinates.value(i, 0.0) * QUIET / Q_BOUNDS[0] for i in process):
         return False
     windows = search.plan.windows
-    found = assessor(trial.optimum.z, windows)
+    found = assessor(z, windows)
     if not np.isfinite(np.asarray(found.track.innovation)[windows.ok > 0]).all():  # it ran away
         return True
     known = np.isfinite(found.ahead).any(axis=(0, 1))
     if not known.any():  # windows without a row so far ahead
         return False
-    error = rmse(found.ahead[..., known])
-    noise = np.array([search.plan.coordinates.value(i, float(trial.optimum.z[i])) for i in range(n_p, n_p + n_r)])
-    return bool(np.any(error > NEAR * noise[known]))
+    noise = np.array([coordinates.value(i, float(z[i])) for i in range(n_p, n_p + n_r)])
+    return bool(np.any(rmse(found.ahead[..., known]) > NEAR * noise[known]))

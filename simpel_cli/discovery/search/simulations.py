@@ -10,9 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simpel_cli.discovery.search.acceptance import accepted
+from simpel_cli.discovery.search.acceptance import accepted, proposed
 from simpel_cli.discovery.search.held_out_gate import Gate
-from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, names_of
@@ -74,9 +73,8 @@ def chosen_by_simulations(
         )
         path.append(simulated.best(trial.terms, simulated.fitter([start])))
     own = path[-1]
-    judged = accepted(simulated, assessor, path[0], options, terminal, tuple(path))
-    assert not isinstance(judged, Wider)  # of ranges it is not asked
-    other, gates = judged
+    other = proposed(simulated, assessor, path[0], options, tuple(path))
+    other, gates = accepted(simulated, assessor, other, terminal)
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")

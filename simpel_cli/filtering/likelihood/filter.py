@@ -230,7 +230,6 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
-                # what is worked out apart, is so at once: it sees the values of this turn of the loop
                 reach = apart(sure, applied, cov, slope[j])
                 given = (predicted, x, cov), reach, off[j], slope[j], noise.r[j] ** 2 * larger[j], ok_k[j]
                 x, cov, e, s, gain = apart(sure, taken, *given)

@@ -15,7 +15,7 @@ from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
 from simpel_cli.filtering.likelihood.sensor_delay import back, echo
-from simpel_cli.filtering.likelihood.small_matrices import apart, applied, sure_of
+from simpel_cli.filtering.likelihood.small_matrices import apart, applied, sure_of, where_asked
 from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
 
@@ -56,7 +56,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         if timing.of_inputs:
             asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
             moved = jnp.moveaxis(
-                _if(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
+                where_asked(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
             )
             moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
         at_rows = lambda a: jnp.expand_dims(a, a.ndim - p.ndim + 1)  # noqa: E731
@@ -154,7 +154,7 @@ def _pushed(of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved
         by_u = _slopes(of, p, x, u).by_u
         return jax.vmap(lambda d: applied(by_u, d))(moved)
 
-    return found + _if(asked, by_inputs)
+    return found + where_asked(asked, by_inputs)
 
 
 def _beside(p: Array, x: Array) -> Array:
@@ -239,12 +239,6 @@ def _along(function: Callable[[Array], Any], p: Array, units: Array) -> Any:
     return jax.vmap(lambda unit: jax.jvp(function, (p,), (unit,))[1])(units)
 
 
-def _if(asked: Array, worked_out: Callable[[], Array]) -> Array:
-    """Zeros where it is not asked for."""
-    shape = jax.eval_shape(worked_out)
-    return jax.lax.cond(asked, worked_out, lambda: jnp.zeros(shape.shape, shape.dtype))
-
-
 def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
     """Apply a function of rows, which lead, to so many at once."""
     count = len(jax.tree.leaves(rows)[0])
@@ -253,6 +247,6 @@ def _in_parts(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
         return function(rows)
     size = -(-count // parts)
     filled = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], parts * size - count, axis=0)]), rows)
-    apart = jax.tree.map(lambda a: a.reshape(parts, size, *a.shape[1:]), filled)
-    found = jax.lax.map(function, apart)
+    cut = jax.tree.map(lambda a: a.reshape(parts, size, *a.shape[1:]), filled)
+    found = jax.lax.map(function, cut)
     return jax.tree.map(lambda a: a.reshape(parts * size, *a.shape[2:])[:count], found)

@@ -33,8 +33,13 @@ def apart(sure: Bool[Array, ""], work: Callable[..., Any], *values: Any) -> Any:
     """
     if current_device().platform != "cpu":
         return jax.lax.optimization_barrier(work(*values))
+    return where_asked(sure, work, *values)
+
+
+def where_asked(asked: Bool[Array, ""], work: Callable[..., Any], *values: Any) -> Any:
+    """Zeros where something is not asked for, which is not worked out then."""
     shapes = jax.eval_shape(work, *values)
-    return jax.lax.cond(sure, work, lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), *values)
+    return jax.lax.cond(asked, work, lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), *values)
 
 
 def along(a: Array, extra: int) -> Array:
