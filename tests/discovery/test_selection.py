@@ -38,9 +38,7 @@ class MadeUp:
     def __init__(self, row: int, neutral: float) -> None:
         self.row, self.neutral, self.far = row, neutral, 0
 
-    def __call__(
-        self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: Sequence[bool] | None = None
-    ) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             far = abs(hypothesis.z[self.row] - self.neutral) > 0.02
@@ -116,9 +114,7 @@ class Table:
             return self.evidence[names]
         return max(self.of(names - {name}) for name in names) - 1
 
-    def __call__(
-        self, hypotheses: Sequence[Hypothesis], most: int = 0, *, racing: Sequence[bool] | None = None
-    ) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(hypothesis.free)}

@@ -152,6 +152,13 @@ def test_a_term_on_two_inputs_reads_both_as_they_were_given_in_an_extended_simul
 def test_an_overflow_reaches_the_other_tank_in_part() -> None:
     terms = {t.acts_on: t for t in attached("overflow_into", TANKS)}
     assert set(terms) == {"h, k", "k, h"}
+    # no strength of an effect, whose range may widen: more than all of it cannot reach the other
+    assert {k.label: k.neutral != 0 for k in terms["h, k"].parameters} == {
+        "k": False,
+        "x_max": True,
+        "w": True,
+        "s": True,
+    }
     spill, share, sharp = 0.7 * (0.9 - 0.6), 0.4, 1e-9
     np.testing.assert_allclose(
         push(TANKS, terms["h, k"], [0.9, 0.2], [0.0], [0.7, 0.6, sharp, share]), [-spill, share * spill]

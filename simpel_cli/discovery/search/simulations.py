@@ -97,7 +97,6 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
     )
     search.known.clear()
     search.asked.clear()
-    search.raced.clear()
     search.banned = simulated.banned
     search.tried += simulated.tried
     for trial, optimum in zip(moved, here, strict=True):

@@ -98,7 +98,6 @@ class Search:
         self.declared: dict[str, tuple[float, float]] = {}  # ranges of parameters that are wider here than was declared
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
-        self.raced: set[frozenset[int]] = set()  # sets whose best fit may have left a race
         self.asked: dict[tuple[Any, ...], Stage] = {}  # what was added to what already
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
@@ -217,7 +216,7 @@ class Search:
         return starts
 
     def add(self, before: Trial, candidates: Sequence[int], least: float = PROMISING, *, widely: bool = False) -> Stage:
-        """Fit `before` with one of the candidates more, each from its promising starts, as far as it can catch up; best first.
+        """Fit `before` with one of the candidates more, each from its promising starts; best first.
 
         Args:
             before: the model without it.
@@ -247,16 +246,13 @@ class Search:
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
         begun = [*(starts[i] for i in going), *more]
         fits: dict[int, list[Optimum]] = {}
-        # names race with names: a function without one keeps none from being fitted
-        racing = [bool(self.terms[t].depends_on) for t, _ in begun]
-        for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun], racing=racing), strict=True):
+        for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun]), strict=True):
             fits.setdefault(t, []).append(optimum)
         # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
         astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
         for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
             fits[t].append(optimum)
         trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
-        self.raced |= {frozenset(t.terms) for t in trials if not t.optimum.converged}
         left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
         ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
         return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
@@ -297,10 +293,7 @@ class Search:
 
     def part(self, current: Trial, rest: tuple[int, ...]) -> Trial:
         """Return the best fit of some of a model's terms, which is made if there is none yet."""
-        name = frozenset(rest)
-        known = name in self.known and (name not in self.raced or name == frozenset(current.terms))
-        self.raced.discard(name)
-        return self.best(rest, () if known else self.fitter(self.less(current, rest)))
+        return self.best(rest, () if frozenset(rest) in self.known else self.fitter(self.less(current, rest)))
 
     def prune(self, current: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
         """Drop what no longer earns its place; return the rest, what each term adds to it, and the rest without it."""

@@ -34,8 +34,6 @@ MOST_REJECTED = 6  # steps in a row
 MOST = 40  # iterations
 ROUND = 4  # iterations after which fits that have arrived make room for others
 SLOW = 0.1  # nats: a round that gains less, with a step that helped at its end, ends a fit that crawls along a valley
-BEHIND = 20.0  # nats behind the best of a race: nothing nearer is given up
-LAPS = 10  # rounds at the present pace
 LEGS = 8  # of a step, between which unknowns meet the ends of their ranges
 FIRST_DAMPING = 1e-2
 
@@ -111,38 +109,25 @@ class Fitter:
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
         self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
-    def __call__(
-        self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: Sequence[bool] | None = None
-    ) -> list[Optimum]:
-        """Fit every hypothesis with `most` iterations.
-
-        Args:
-            hypotheses: to fit.
-            most: iterations.
-            racing: of two kinds, which each is; of either the best count: what lies `BEHIND` the best of its kind, and would
-                at its pace of the last round need more than `LAPS` rounds to catch up, ends there.
-        """
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST) -> list[Optimum]:
+        """Fit every hypothesis with `most` iterations."""
         if not hypotheses:
             return []
         state = self._begin(hypotheses)
         waiting = np.arange(len(hypotheses))
-        kinds = np.zeros(len(hypotheses), bool) if racing is None else np.array(racing, bool)
         while waiting.size:
             before = state.loss[waiting]
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
-            advanced = self._threads.map(partial(self._advanced, state, most), chunks)
-            for chunk, course in zip(chunks, advanced, strict=True):
-                for old, new in zip(state, course, strict=True):
+            for chunk, ended in zip(
+                chunks, self._threads.map(partial(self._advanced, state, most), chunks), strict=True
+            ):
+                for old, new in zip(state, ended, strict=True):
                     old[chunk] = new[: len(chunk)]
             both = np.isfinite(before) & np.isfinite(state.loss[waiting])
             gained = np.subtract(before, state.loss[waiting], where=both, out=np.full(len(waiting), np.inf))
             # a step that helped with the damping of a refusal is short, whatever is left to gain
-            walks = both & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
-            best = np.array([state.loss[kinds == kind].min(initial=np.inf) for kind in (False, True)])
-            behind = np.where(both, state.loss[waiting], 0.0) - best[kinds[waiting].astype(int)]
-            lost = (behind > BEHIND) & (behind > LAPS * gained) & (racing is not None)
-            ended = state.done[waiting] | (walks & ((gained < SLOW) | lost)) | (state.iteration[waiting] >= most)
-            waiting = waiting[~ended]
+            crawls = (gained < SLOW) & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
+            waiting = waiting[~state.done[waiting] & ~crawls & (state.iteration[waiting] < most)]
         return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]
 
     def on(self, windows: Windows) -> "Fitter":

@@ -56,11 +56,9 @@ class Spreading:
         self.fitter, self.spreads = fitter, spreads
         self.width, self.coordinates = fitter.width, fitter.coordinates
 
-    def __call__(
-        self, hypotheses: Sequence[Hypothesis], most: int = MOST, *, racing: Sequence[bool] | None = None
-    ) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST) -> list[Optimum]:
         """Fit every hypothesis; one that leaves windows out, or of a single iteration, keeps its spreads."""
-        found = self.fitter(hypotheses, most, racing=racing)
+        found = self.fitter(hypotheses, most)
         if most < MOST:
             return found
         moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight == 1) and self._here(found[i])]
