@@ -91,13 +91,12 @@ def widely(search: Search, found: Selection) -> Selection:
     if search.budget.over("effects that begin anywhere in their ranges"):
         return found
     search.report("beginning anywhere in the ranges of effects")
-    paths = [found.path[:1], found.path] if found.chosen.terms else [found.path]
-    others = [_grow(search, path, widely=True) for path in paths]
+    others = [_grow(search, found.path[:1], widely=True)]
+    if found.chosen.terms:
+        beside = _grow(search, found.path, widely=True)
+        others.append(beside._replace(stages=(*found.stages[:-1], *beside.stages)))  # the last one found nothing more
     best = max(others, key=lambda g: worth(g.path[-1]))
-    stages = found.stages + tuple(stage for grown in others for stage in grown.stages)
-    if worth(best.path[-1]) < worth(found.chosen) + ASTRAY:
-        return found._replace(stages=stages)
-    return _settled(search, best._replace(stages=stages))
+    return found if worth(best.path[-1]) < worth(found.chosen) + ASTRAY else _settled(search, best)
 
 
 def _settled(search: Search, grown: _Grown) -> Selection:
@@ -183,6 +182,7 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False) -> _
         if best is None or not gain > least or len(current.terms) == MOST_EFFECTS:
             if widely and not wide and len(current.terms) < MOST_EFFECTS:
                 wide = True
+                stages.pop()  # of the same candidates: they are tried again, from more places
                 continue
             if unnamed is not None and gain_unnamed > ACCEPT:
                 remainder = (search.terms[unnamed.terms[-1]], float(gain_unnamed))
