@@ -131,7 +131,8 @@ def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, 
             f"without what was added it fits {chosen.optimum.log_evidence - first.optimum.log_evidence:.0f} nats better"
         )
         again = _grow(search, _path(search, chosen))
-        grown = again._replace(stages=(*(grown.stages if chosen.terms else ()), *again.stages))
+        led = (stage for stage in grown.stages if len(stage.before.terms) < len(chosen.terms))
+        grown = again._replace(stages=(*led, *again.stages))
 
 
 def worth(trial: Trial) -> float:
