@@ -34,7 +34,7 @@ from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows, thinned
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, test_windows
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, whole_windows
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.declared import Declared
@@ -192,12 +192,12 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
         base = within(search, narrow, base)
 
     def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial] = suited) -> Trial:
-        assessor = Assessor(search.plan, found.assessor.horizon)
+        assessor = found.assessor.of(search.plan)
         return calibration(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
     path, before = selection.path, selection.path[-1]
     if use != ONE_STEP:
-        whole = thinned(test_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
+        whole = thinned(whole_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
         base, chosen = of_use(narrow or search, base), of_use(search, before)
         # what is between follows the last
         path = (*(of_use(search, t, calibrated_for) for t in path[:-1]), chosen) if chosen is not before else path
@@ -318,7 +318,7 @@ def _with(
         return fitter_of(plan, options.lanes, options.room + members(plan))
 
     def begun_in(plan: Setup) -> tuple[Assessor, Calibrated]:
-        assessor = Assessor(plan, options.horizon)
+        assessor = Assessor(plan, options.horizon, options.first_rows)
         found = calibrated(plan, fitter(plan), assessor, ground.clean, terminal)
         found.search.budget = ground.budget
         return assessor, found
@@ -359,7 +359,7 @@ def _with(
     if options.simulations and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
-        ahead = Assessor(simulated.plan, options.horizon)
+        ahead = assessor.of(simulated.plan)
         by_simulations = chosen_by_simulations(search, selection, simulated, ahead, options, terminal)
         if by_simulations is not None:
             if (ends := wider(simulated, by_simulations[0].chosen)) is not None:

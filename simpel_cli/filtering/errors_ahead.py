@@ -18,6 +18,7 @@ from simpel_cli.runs.programs import Program
 BLOCKS = 10  # of a test window, where there are few episodes
 RAN_AWAY = 1e3  # times the other model's error, where a model has none
 SETTLE = 5  # rows after which the filter knows a state that it started without
+FIRST = 6  # rows from which it is estimated where a free run begins
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -28,10 +29,11 @@ class Assessment(NamedTuple):
         one_step: (W, T, ny) measured minus predicted from all rows before.
         variance: (W, T, ny) that the model claims for it.
         ahead: (W, T, ny) the same from the state `horizon` rows before, without looking at rows in between.
-        free: (W, T, ny) the same from row SETTLE on without ever looking again, the simulation alone.
+        free: (W, T, ny) the same after the first rows without ever looking again, the simulation alone.
         log_likelihood: (W,) of the window's measurements.
         free_mean: (W, T, ny) the free run itself.
         track: of the filter.
+        first: rows from which the state is estimated with which the free run goes on.
     """
 
     one_step: np.ndarray
@@ -41,20 +43,33 @@ class Assessment(NamedTuple):
     log_likelihood: np.ndarray
     free_mean: np.ndarray
     track: Track
+    first: int = FIRST
 
 
 class Assessor:
-    """Runs one model over windows; one compiled program per shape of the windows."""
+    """Runs one model over windows; one compiled program per shape of the windows.
 
-    def __init__(self, plan: Setup, horizon: int) -> None:
-        self.plan, self.horizon = plan, horizon
-        self._program = _program(plan.rule, plan.coordinates.layout, horizon)
+    Args:
+        plan: whose models they are.
+        horizon: rows ahead.
+        first: rows of a window from which the state is estimated that a free run begins with.
+    """
+
+    def __init__(self, plan: Setup, horizon: int, first: int = FIRST) -> None:
+        self.plan, self.horizon, self.first = plan, horizon, first
+        self._program = _program(plan.rule, plan.coordinates.layout, horizon, first)
+
+    def of(self, plan: Setup, horizon: int | None = None) -> "Assessor":
+        """Return the same for models of another setup, or so many rows ahead."""
+        return Assessor(plan, self.horizon if horizon is None else horizon, self.first)
 
     def __call__(self, z: np.ndarray, windows: Windows) -> Assessment:
         """Assess the model at unit coordinates z."""
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
         count, batch = len(windows.episode), len(self.plan.windows.episode)
-        # batches of one size: windows to learn from and to test on share a program
+        if windows.y.shape[1] != self.plan.windows.y.shape[1]:
+            batch = min(batch, count)
+        # batches of one size: windows to learn from and to test on share a program where they are equally long
         parts = [
             self._program(bounds, jnp.asarray(z), *(a[np.arange(i, i + batch) % count] for a in windows.arrays))
             for i in range(0, count, batch)
@@ -63,13 +78,12 @@ class Assessor:
         ok = np.where(windows.ok > 0, 1.0, np.nan)
         e, s = track.innovation * ok, track.variance
         log_likelihood = -0.5 * np.nansum(np.log(s) * ok + e**2 / s + LOG_2PI * ok, axis=(1, 2))
-        rows = np.arange(windows.y.shape[1])
-        late = rows >= SETTLE
-        wrap = self._wrapped(windows.y - free) * ok * np.where(late, 1.0, np.nan)[None, :, None]
+        alone = self._wrapped(windows.y - free) * ok
+        alone[:, : self.first] = np.nan
         horizon = self._wrapped(windows.y - ahead) * ok
         horizon[:, : SETTLE + self.horizon] = np.nan
         e[:, :SETTLE] = np.nan
-        return Assessment(e, s, horizon, wrap, log_likelihood, free, track)
+        return Assessment(e, s, horizon, alone, log_likelihood, free, track, self.first)
 
     def free_runs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
         """Return the errors of free runs of several models at once, (models, W, T, ny), as `free` of an assessment.
@@ -80,10 +94,12 @@ class Assessor:
         """
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
         free = np.asarray(
-            _free_program(self.plan.rule, self.plan.coordinates.layout)(bounds, jnp.asarray(z), *windows.arrays)
+            _free_program(self.plan.rule, self.plan.coordinates.layout, self.first)(
+                bounds, jnp.asarray(z), *windows.arrays
+            )
         )
         error = self._wrapped(windows.y - free) * np.where(windows.ok > 0, 1.0, np.nan)
-        error[:, :, :SETTLE] = np.nan
+        error[:, :, : self.first] = np.nan
         return error
 
     def track(self, z: np.ndarray, windows: Windows) -> Track:
@@ -170,62 +186,65 @@ def results(assessment: Assessment, measured: tuple[str, ...], rows: float) -> d
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _program(rule: Filter, layout: tuple[Any, ...], horizon: int) -> Program:
-    every = jax.vmap(partial(_window, rule, layout, horizon), in_axes=(None, None, 0, 0, 0, 0, 0))
-    return Program(every, f"errors {horizon} ahead of {rule.name} {layout}", (Track,))
+def _program(rule: Filter, layout: tuple[Any, ...], horizon: int, first: int) -> Program:
+    every = jax.vmap(partial(_window, rule, layout, horizon, first), in_axes=(None, None, 0, 0, 0, 0, 0))
+    return Program(
+        every, f"errors {horizon} ahead, and of free runs from {first} rows, of {rule.name} {layout}", (Track,)
+    )
 
 
 @lru_cache(maxsize=MOST_KEPT)
-def _free_program(rule: Filter, layout: tuple[Any, ...]) -> Program:
-    # what is not returned is not computed
-    one = lambda *given: _window(rule, layout, 1, *given)[2]  # noqa: E731
-    per_window = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, 0))
-    return Program(jax.vmap(per_window, in_axes=(None, 0, *[None] * 5)), f"free runs of {rule.name} {layout}")
+def _free_program(rule: Filter, layout: tuple[Any, ...], first: int) -> Program:
+    per_window = jax.vmap(partial(_alone, rule, layout, first), in_axes=(None, None, 0, 0, 0, 0, 0))
+    every = jax.vmap(per_window, in_axes=(None, 0, *[None] * 5))
+    return Program(every, f"free runs from {first} rows of {rule.name} {layout}")
+
+
+def _alone(
+    rule: Filter, layout: tuple[Any, ...], first: int, bounds: tuple[Array, ...],
+    z: Array, y: Array, ok: Array, u: Array, start: Array, spread: Array,
+) -> Array:  # fmt: skip
+    """Return the free run of a window, (T, ny): the filter sees no more than its first rows."""
+    p, noise = Coordinates.of(bounds, layout).physical(z)
+    lead, seen = len(u) - len(y), min(first, len(y))
+    track, _ = rule.track(p, noise, y[:seen], ok[:seen], u[: lead + seen], start, spread)
+    return _free(rule, p, rule.delayed_inputs(p, u), track.mean, start, seen)
+
+
+def _free(rule: Filter, p: Array, u_sub: Array, mean: Array, start: Array, first: int) -> Array:
+    """Return what is read along a simulation that begins with the filter's mean in the last of the first rows, (T, ny)."""
+    rows = len(u_sub)
+    simulated = jnp.ones(len(start)).at[jnp.array(rule.remainders, int)].set(0.0)
+
+    def run(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], Array]:
+        before, x = carry
+        x = jnp.where(k < first, mean[jnp.minimum(k, first - 1)], x) * simulated
+        last = jnp.maximum(k, 1) - 1
+        read = rule.read(p, before, u_sub[last], x, u_sub[jnp.minimum(last + 1, rows - 1)])
+        return (x, rule.flow(p, x, u_sub[k])), read
+
+    return jax.lax.scan(run, (start, start), jnp.arange(rows))[1]
 
 
 def _window(
-    rule: Filter,
-    layout: tuple[Any, ...],
-    horizon: int,
-    bounds: tuple[Array, ...],
-    z: Array,
-    y: Array,
-    ok: Array,
-    u: Array,
-    start: Array,
-    spread: Array,
-) -> tuple[Track, Array, Array]:
+    rule: Filter, layout: tuple[Any, ...], horizon: int, first: int, bounds: tuple[Array, ...],
+    z: Array, y: Array, ok: Array, u: Array, start: Array, spread: Array,
+) -> tuple[Track, Array, Array]:  # fmt: skip
+    """Return the filter's track, what is read `horizon` rows ahead, and the free run."""
     p, noise = Coordinates.of(bounds, layout).physical(z)
     track, _ = rule.track(p, noise, y, ok, u, start, spread)
     u_sub = rule.delayed_inputs(p, u)
     rows = y.shape[0]
 
-    def following(x: Array, k: Array) -> Array:
-        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)])
-
-    def read(before: Array, x: Array, k: Array) -> Array:
-        """Return what is read in row k, whose state is x."""
-        last, now = jnp.minimum(k - 1, rows - 1), jnp.minimum(k, rows - 1)
-        return rule.read(p, before, u_sub[last], x, u_sub[now])
-
     def step(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], None]:
         _, x = carry
-        return (x, following(x, k)), None
+        return (x, rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)])), None
 
     def from_row(x: Array, k: Array) -> Array:
         before, end = jax.lax.scan(step, (x, x), k + jnp.arange(horizon))[0]
-        return read(before, end, k + horizon)
+        last, now = (jnp.minimum(k + horizon - back, rows - 1) for back in (1, 0))
+        return rule.read(p, before, u_sub[last], end, u_sub[now])
 
     reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
     ahead = jnp.concatenate([y[:horizon], reached])[:rows]
-
-    alone = jnp.ones(len(start)).at[jnp.array(rule.remainders, int)].set(0.0)
-
-    def run(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], Array]:
-        before, x = carry
-        # up to SETTLE the filter's state, from there on the model alone
-        x = jnp.where(k <= SETTLE, track.mean[k], x) * alone
-        return (x, following(x, k)), read(before, x, jnp.maximum(k, 1))
-
-    free = jax.lax.scan(run, (start, start), jnp.arange(rows))[1]
-    return track, ahead, free
+    return track, ahead, _free(rule, p, u_sub, track.mean, start, min(first, rows))

@@ -31,7 +31,7 @@ from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.latent_force import smooth
 from simpel_cli.filtering.measurements.cleaning import cleaned
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import LEAST_ROWS, Setup, setup, test_windows
+from simpel_cli.filtering.setup import LEAST_ROWS, Setup, setup, whole_windows
 from simpel_cli.filtering.tracks import Tracks
 from simulators.model import Model
 from simulators.quantity import BETWEEN_ROWS
@@ -153,7 +153,7 @@ def _of_episodes(
     plan: Setup, tracks: Tracks, z: np.ndarray, episodes: Sequence[Episode], outputs: Sequence[str]
 ) -> list[_Found]:
     """Run filter and smoother along episodes; NaN where a piece is too short for a window."""
-    windows: Windows = begun(tracks, z, test_windows(plan, episodes, outputs))
+    windows: Windows = begun(tracks, z, whole_windows(plan, episodes, outputs))
     track = tracks.track(z, windows)
     smoothed = smooth(track)
     values = (smoothed.mean, _variances(smoothed.cov), np.asarray(track.mean), _variances(np.asarray(track.cov)))

@@ -19,13 +19,14 @@ MOVED = 0.1  # of the spread
 LEAST, MOST = 0.15, 1.0  # of the spread that it began with
 
 
-def begun(filtering: Tracking, z: np.ndarray, windows: Windows) -> Windows:
+def begun(filtering: Tracking, z: np.ndarray, windows: Windows, rows: int | None = None) -> Windows:
     """Return windows with a better guess of the first value of every state that nothing measures.
 
     Args:
         filtering: of the models.
         z: unit coordinates of a model with loud noise.
         windows: whose first states are guessed.
+        rows: of a window that the guess may look at; None: all of them.
     """
     augmented = filtering.plan.augmented
     states = augmented.model.states
@@ -36,7 +37,7 @@ def begun(filtering: Tracking, z: np.ndarray, windows: Windows) -> Windows:
     first = windows.spread[:, hidden]
     for _ in range(PASSES):
         try:
-            found = smooth(filtering.track(z, windows))
+            found = smooth(filtering.track(z, windows if rows is None else windows.first(rows)))
         except np.linalg.LinAlgError:
             break
         mean = found.mean[:, 0][:, hidden]

@@ -241,11 +241,13 @@ def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.
     return np.where(np.isfinite(rates).any(axis=1), np.sqrt(np.nanmean(rates**2, axis=1)), (high - low) / 2)
 
 
-def test_windows(plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str]) -> Windows:
-    """Cut held-out episodes into windows like those of the search, each as long as its episode."""
+def whole_windows(
+    plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str], longest: int | None = None
+) -> Windows:
+    """Cut episodes into windows like those of the search, each as long as its episode, or as `longest` (`LONGEST_RUN`)."""
     model = plan.augmented.model
     return windows_of(
         episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
         lead=plan.lead, dt=model.dt, clocked=plan.clocked,
-        longest=windows_.LONGEST_TEST,
+        longest=longest or windows_.LONGEST_RUN,
     )  # fmt: skip

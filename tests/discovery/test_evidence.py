@@ -10,7 +10,7 @@ from simpel_cli.discovery.verdict.evidence import EvidenceTable, evidence_tables
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Optimum
 from simpel_cli.filtering.setup import setup
-from simpel_cli.filtering.setup import test_windows as held_out
+from simpel_cli.filtering.setup import whole_windows as held_out
 from simulators.effects import Expression
 
 DRAG = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": {"range": [0, 1], "unit": "1/V"}})

@@ -24,7 +24,7 @@ from simpel_cli.filtering.likelihood.coordinates import CUT
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.likelihood.sensitivity import shifts, waves
 from simpel_cli.filtering.setup import Setup, key_of, setup
-from simpel_cli.filtering.setup import test_windows as windows_of_tests
+from simpel_cli.filtering.setup import whole_windows as windows_of_tests
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, functions_of_two
 from simulators.model import Declared

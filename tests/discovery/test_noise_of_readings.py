@@ -7,7 +7,7 @@ from test_heavy_tailed_readings import DT, NOISE, errors, fitted, model
 
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.dynamics.transition import encoding_of
-from simpel_cli.filtering.setup import test_windows as windows_to_test
+from simpel_cli.filtering.setup import whole_windows as windows_to_test
 from simpel_cli.inference.noise_scale import noise_scale_of
 
 ROWS, FORMULA = 120, "0.15 + u**2"

@@ -15,7 +15,7 @@ from simpel_cli.discovery.verdict.beyond import beyond, ranges_of, sentence_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
-from simpel_cli.filtering.setup import test_windows as held_out  # pytest would take it for a test
+from simpel_cli.filtering.setup import whole_windows as held_out
 from simulators.effects import Expression
 from simulators.model import Declared, Model
 

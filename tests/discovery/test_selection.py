@@ -299,7 +299,7 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     none_left = np.zeros_like(test.ok)
     data = Recording((), (), (), {}, (), (), ())
     for name, stub in {
-        "test_windows": lambda *_: test,
+        "whole_windows": lambda *_: test,
         "begun": lambda _, __, windows: windows,
         "gated": lambda _, __, windows: windows._replace(ok=none_left) if windows.begin[0] else windows,
         "without_new": lambda clean, _, after, __: (clean, after),

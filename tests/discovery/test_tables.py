@@ -14,7 +14,7 @@ from simpel_cli.discovery.verdict.tables import (
     residual_columns,
     trajectory_columns,
 )
-from simpel_cli.filtering.errors_ahead import BLOCKS, SETTLE, Assessment, in_parts
+from simpel_cli.filtering.errors_ahead import BLOCKS, FIRST, Assessment, in_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import windows_of
 
@@ -74,7 +74,7 @@ def test_innovations_and_free_runs() -> None:
     runs = trajectory_columns(found, found, WINDOWS, EPISODES, {"x": "m"})
     np.testing.assert_allclose(runs["after"], runs["measured"] + 1)
     np.testing.assert_allclose(runs["measured"], runs["time"] ** 2)
-    assert not runs["free"][:SETTLE].any()
+    assert not runs["free"][:FIRST].any()
 
 
 def test_errors() -> None:

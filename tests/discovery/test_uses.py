@@ -11,7 +11,7 @@ from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, correlation_time, suited
 from simpel_cli.errors import ConfigError
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
-from simpel_cli.filtering.setup import test_windows as held_out  # pytest would take it for a test
+from simpel_cli.filtering.setup import whole_windows as held_out
 
 
 @pytest.mark.parametrize("use", [FREE_RUN, 1.0])

@@ -130,7 +130,7 @@ def test_behind_the_last_stamp_the_last_input_acts() -> None:
 
 def test_angles_go_round_between_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """An encoder that is silent where a window begins: the filter begins there on the turn about 0, whatever the record's."""
-    monkeypatch.setattr("simpel_cli.filtering.setup.windows_.LONGEST_TEST", 50)
+    monkeypatch.setattr("simpel_cli.filtering.setup.windows_.LONGEST_RUN", 50)
     wheel = Declared(
         "wheel", dt=0.1,
         states={

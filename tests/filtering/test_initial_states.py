@@ -64,3 +64,20 @@ def test_better_parameters_put_it_elsewhere(plan: Setup) -> None:
 
 def test_the_rates_of_a_hidden_level_have_the_scale_of_the_model(plan: Setup) -> None:
     assert 1.0 < plan.scales.rate["h_1"] < 0.325 * np.sqrt(120)  # c sqrt(h), not half of the range per second
+
+
+def test_of_a_free_run_only_its_first_rows_are_seen(plan: Setup) -> None:
+    """Where a hidden level begins and where the run begins are told by the first rows; what follows could be anything."""
+    assessor, rows = Assessor(plan, 5, 8), np.arange(plan.windows.y.shape[1])
+    after = plan.windows._replace(y=np.where(rows[:, None] < 8, plan.windows.y, 3.0))
+    first, other = (begun(assessor, plan.start, windows, 8) for windows in (plan.windows, after))
+    np.testing.assert_array_equal(first.start, other.start)
+    assert np.any(begun(assessor, plan.start, after).start != other.start)
+    found, changed = (assessor(plan.start, windows) for windows in (first, other))
+    np.testing.assert_allclose(found.free_mean, changed.free_mean, rtol=1e-9)
+    assert found.first == 8
+    assert np.isnan(found.free[:, :8]).all()
+    assert np.isfinite(found.free[:, 8:]).all()
+    alone = assessor.free_runs(plan.start[None], first)[0]
+    np.testing.assert_allclose(alone[:, 8:], found.free[:, 8:], rtol=1e-6, atol=1e-9)
+    assert assessor.of(plan, 3).first == 8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.filtering.errors_ahead import SETTLE, Assessor
+from simpel_cli.filtering.errors_ahead import FIRST, Assessor
 from simpel_cli.filtering.setup import Setup, setup
 from simulators.model import Declared
 
@@ -74,10 +74,10 @@ def test_a_free_run_is_the_simulation_alone() -> None:
     for row, value in zip((0, 1, n_p, n_p + n_r), (RATE, 0.3, 0.01, 0.15), strict=True):
         z[row] = plan.coordinates.unit(row, value)
     found = Assessor(plan, 5)(z, plan.windows)
-    assert np.abs(found.track.mean[:, SETTLE, 1]).max() > 0.05
+    assert np.abs(found.track.mean[:, FIRST - 1, 1]).max() > 0.05
     for w in range(len(found.free)):
-        x, begin = found.track.mean[w, SETTLE, 0], plan.windows.begin[w]
-        for k in range(SETTLE, plan.windows.y.shape[1] - 1):
+        x, begin = found.track.mean[w, FIRST - 1, 0], plan.windows.begin[w]
+        for k in range(FIRST - 1, plan.windows.y.shape[1] - 1):
             u = measured().train[plan.windows.episode[w]].inputs[begin + k, 0]
             x = u / RATE + (x - u / RATE) * np.exp(-RATE * DT)
             assert found.free_mean[w, k + 1, 0] == pytest.approx(x, abs=1e-5)

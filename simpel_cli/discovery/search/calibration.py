@@ -17,8 +17,8 @@ from simpel_cli.filtering.initial_states import begun, moved
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.measurements.cleaning import Cleaned
-from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.filtering.setup import Key, Setup, key_of, questions, test_windows
+from simpel_cli.filtering.measurements.windows import LONGEST_TEST, Windows
+from simpel_cli.filtering.setup import Key, Setup, key_of, questions, whole_windows
 from simpel_cli.filtering.tracks import Tracks
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Term
@@ -113,17 +113,22 @@ def calibrated(plan: Setup, fitter: Fitter, assessor: Assessor, clean: Cleaned, 
         terminal: takes lines that say what goes on.
     """
     recording, names = clean.recording, plan.augmented.measured
-    raw = {"train": plan.windows, "test": test_windows(plan, recording.test, recording.outputs)}
+    raw = {"train": plan.windows, "test": whole_windows(plan, recording.test, recording.outputs, LONGEST_TEST)}
     if plan.spare is not None:
         raw["spare"] = plan.spare
-    cut = {split: begun(assessor, plan.start, windows) for split, windows in raw.items()}
+    # what a free run of the test may begin with is what its first rows tell
+    seen = {"test": assessor.first}
+    cut = {split: begun(assessor, plan.start, windows, seen.get(split)) for split, windows in raw.items()}
     report = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):
         search = Search(plan._replace(windows=cut["train"], spare=cut.get("spare")), fitter.on(cut["train"]), report)
         base = search.base()
         z = base.optimum.z
         # where hidden states begin was guessed with parameters from the middle of their ranges
-        again = {split: begun(assessor, z, raw[split]._replace(ok=windows.ok)) for split, windows in cut.items()}
+        again = {
+            split: begun(assessor, z, raw[split]._replace(ok=windows.ok), seen.get(split))
+            for split, windows in cut.items()
+        }
         after = {split: gated(assessor, z, windows) for split, windows in again.items()}
         clean, after = without_new(clean, cut, after, names)
         same = np.array_equal(after["train"].ok, cut["train"].ok) and not moved(cut["train"], after["train"])

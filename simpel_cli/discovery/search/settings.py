@@ -6,6 +6,7 @@ from simpel_cli.discovery.search.budget import seconds_of
 from simpel_cli.discovery.search.selection import BEGINNINGS
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP
 from simpel_cli.errors import ConfigError, check_at_least_one
+from simpel_cli.filtering.errors_ahead import FIRST
 
 PAIR = 11  # unknowns of a function of two arguments beside an effect
 
@@ -16,6 +17,8 @@ class Discovery:
 
     Args:
         horizon: how far ahead errors are judged, in rows.
+        first_rows: rows of an episode from which the state is estimated that its free run begins with; errors of the free run
+            are those of the rows behind.
         substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 8 at most.
         lanes: fits that run side by side in the compiled program.
         room: unknowns of effects that a hypothesis can have at once; time grows with it.
@@ -33,6 +36,7 @@ class Discovery:
     """
 
     horizon: int = 20
+    first_rows: int = FIRST
     substeps: int | None = None
     lanes: int = 4
     room: int = 9
@@ -48,7 +52,7 @@ class Discovery:
             raise ConfigError(
                 f"discovery.room: got {self.room}; discovery.pairs needs {PAIR}: a function of two has 9."
             )
-        check_at_least_one("discovery", self, ("horizon", "lanes", "room", "rows"))
+        check_at_least_one("discovery", self, ("horizon", "first_rows", "lanes", "room", "rows"))
         if isinstance(self.for_, str) and self.for_ not in (ONE_STEP, FREE_RUN):
             raise ConfigError(
                 f"discovery.for: got {self.for_!r}; allowed are {FREE_RUN}, {ONE_STEP}, or how many seconds ahead, e.g. 0.5."

@@ -165,5 +165,5 @@ def _placed(trial: Trial, rows: list[int], z: np.ndarray, covariance: np.ndarray
 def _errors_of(assessor: Assessor, windows: Windows, use: str | float, dt: float) -> Errors:
     if use == FREE_RUN:
         return lambda z: assessor.free_runs(z, windows)
-    ahead = Assessor(assessor.plan, max(1, round(float(use) / dt)))
+    ahead = assessor.of(assessor.plan, max(1, round(float(use) / dt)))
     return lambda z: np.stack([ahead(one, windows).ahead for one in z])

@@ -9,7 +9,7 @@ from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.search.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import before_of, interval_of
-from simpel_cli.filtering.errors_ahead import SETTLE, Assessment, in_parts
+from simpel_cli.filtering.errors_ahead import Assessment, in_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import Windows, pieces
 from simulators.groups import MEMBER, SPREAD
@@ -114,7 +114,7 @@ def trajectory_columns(
                     "output": np.full(n, name), "unit": np.full(n, unit),
                     "measured": np.where(windows.ok[w, :n, j] > 0, windows.y[w, :n, j], np.nan),
                     "before": before.free_mean[w, :n, j], "after": after.free_mean[w, :n, j],
-                    "free": np.arange(n) >= SETTLE,
+                    "free": np.arange(n) >= before.first,
                 }
             )  # fmt: skip
     return joined(parts)

@@ -15,7 +15,8 @@ LONGEST = 256  # rows of a window: a longer record is cut, and its windows run s
 LEAST_EPISODES = 3  # to hold out whole ones
 UNEVEN = 0.01  # of a step: a clock that strays less is taken for even
 ROUNDED = 3  # different steps of an even clock with rounded stamps; one more than two, since floating point rounds, too
-LONGEST_TEST = 2048  # of a window on which free runs are judged
+LONGEST_RUN = 2048  # of a window along which free runs are calibrated
+LONGEST_TEST = 65_536  # of one on which they are judged
 
 
 class Windows(NamedTuple):
@@ -49,6 +50,13 @@ class Windows(NamedTuple):
         clock = np.pad(self.clock, ((0, 0), (lead, 0), (0, 0)))
         u = np.concatenate([self.u, clock], axis=2)
         return tuple(jnp.asarray(a) for a in (self.y, self.ok, u, self.start, self.spread))
+
+    def first(self, rows: int) -> "Windows":
+        """Return the first rows of every window."""
+        lead = self.u.shape[1] - self.clock.shape[1]
+        return self._replace(
+            y=self.y[:, :rows], ok=self.ok[:, :rows], u=self.u[:, : lead + rows], clock=self.clock[:, :rows]
+        )
 
 
 def thinned(windows: Windows, rows: int) -> tuple[Windows, Windows | None]:

@@ -145,7 +145,7 @@ def groupings(
     asked = [question(e.name, by) for e in alike for by in columns]
     several = len({t.effect for t in terms[: len(chosen.terms)]}) < len(chosen.terms)
     most = 1 if several else min(max(len(chosen.terms), 1), MOST_GROUPED)  # what the program has room for
-    found = judged(small, Assessor(small.plan, assessor.horizon), own, asked, most)
+    found = judged(small, assessor.of(small.plan), own, asked, most)
     search.tried += small.tried
     for one in found:
         terminal.line(in_words(one), "groups")

@@ -15,7 +15,6 @@ from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.unexplained.pair_screening import Promise, promised
-from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
@@ -93,7 +92,7 @@ def interaction(
     rest = tuple(t for t in own if t in after.terms)
     before = small.best(rest, small.fitter(small.less(after, rest)))
     gain = after.optimum.log_evidence - before.optimum.log_evidence
-    (judged,) = gates(small, Assessor(plan, assessor.horizon), after, [before])
+    (judged,) = gates(small, assessor.of(plan), after, [before])
     return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
 
 
