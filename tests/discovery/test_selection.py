@@ -13,7 +13,7 @@ from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import searched as searched_module
-from simpel_cli.discovery.search import acceptance, calibration
+from simpel_cli.discovery.search import acceptance, calibration, selection
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, proposed
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
@@ -149,8 +149,10 @@ def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
     assert Table(gains | {"DE": 60.9 - asked(3)}).chosen(beginnings=0) == "ABD"
 
 
-def test_the_search_begins_with_another_effect_where_one_is_not_enough() -> None:
+def test_the_search_begins_with_another_effect_where_one_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     gains = {"": 0.0, "A": 30.0, "AD": 41.0, "B": 25.0, "BC": 80.0}
+    assert Table(gains).chosen(beginnings=0) == "BC"  # as a pair, which makes the rest superfluous
+    monkeypatch.setattr(selection, "together", lambda *_: None)
     assert Table(gains).chosen() == "BC"
     assert Table(gains).chosen(beginnings=0) == "AD"
     assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
@@ -300,7 +302,7 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     data = Recording((), (), (), {}, (), (), ())
     for name, stub in {
         "whole_windows": lambda *_: test,
-        "begun": lambda _, __, windows: windows,
+        "begun": lambda _, __, windows, *___: windows,
         "gated": lambda _, __, windows: windows._replace(ok=none_left) if windows.begin[0] else windows,
         "without_new": lambda clean, _, after, __: (clean, after),
         "Search": lambda *_: table.search,

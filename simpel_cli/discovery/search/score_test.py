@@ -40,53 +40,73 @@ def promises(
     z: np.ndarray,
     starts: Sequence[tuple[int, Hypothesis]],
 ) -> list[Score]:
-    """Return what each start of each term promises.
+    """Return what each start of each term promises by itself: see `promises_of_sets`."""
+    return promises_of_sets(plan, fit, width, known, z, starts, [(i,) for i in range(len(starts))])
+
+
+def promises_of_sets(
+    plan: Setup,
+    fit: Callable[[list[Hypothesis], int], list[Optimum]],
+    width: int,
+    known: tuple[int, ...],
+    z: np.ndarray,
+    starts: Sequence[tuple[int, Hypothesis]],
+    sets: Sequence[tuple[int, ...]],
+) -> list[Score]:
+    """Return what each set of starts promises together.
 
     Args:
         plan: of the search.
         fit: of hypotheses, with so many iterations.
         width: free unknowns that a hypothesis may have.
-        known: unknowns that move in the model without the term.
+        known: unknowns that move in the model without the terms.
         z: optimum of that model, unit coordinates.
         starts: term and start; parameters whose neutral value is 0 are amplitudes and are switched off, others keep it.
+        sets: places in `starts`, of different terms each.
     """
     terms = plan.augmented.terms
     rows = {term: tuple(plan.augmented.rows(terms[term])) for term, _ in starts}
     room = width - len(known)
-    groups: list[list[int]] = []
-    for i, (term, hypothesis) in enumerate(starts):
-        if (
-            terms[term].groupings
-            or not any(k.neutral == 0 for k in terms[term].parameters)
-            or _late(plan, term, rows[term][0], hypothesis)
-        ):
+    told = [
+        not terms[term].groupings
+        and any(k.neutral == 0 for k in terms[term].parameters)
+        and not _late(plan, term, rows[term][0], hypothesis)
+        for term, hypothesis in starts
+    ]
+    groups: list[dict[int, int]] = []  # term -> its start
+    group_of: dict[int, int] = {}
+    for k, one in enumerate(sets):
+        own = {starts[i][0]: i for i in one}
+        if not all(told[i] for i in one):
             continue
-        for group in groups:
-            used = {starts[j][0] for j in group}
-            if term not in used and len(rows[term]) + sum(len(rows[t]) for t in used) <= room:
-                group.append(i)
+        for g, group in enumerate(groups):
+            both = group | own
+            alike = all(group.get(term, i) == i for term, i in own.items())
+            if alike and sum(len(rows[term]) for term in both) <= room:
+                groups[g], group_of[k] = both, g
                 break
         else:
-            groups.append([i])
+            groups.append(own)
+            group_of[k] = len(groups) - 1
     ones = np.ones(len(plan.windows.episode))
     hypotheses = []
     for group in groups:
         start = z.copy()
-        for i in group:
-            term, hypothesis = starts[i]
+        for term, i in group.items():
             for row, parameter in zip(rows[term], terms[term].parameters, strict=True):
-                start[row] = plan.start[row] if parameter.neutral == 0 else hypothesis.z[row]
-        hypotheses.append(Hypothesis(start, known + tuple(r for i in group for r in rows[starts[i][0]]), ones))
-    found = [UNTOLD] * len(starts)
-    for group, optimum in zip(groups, fit(hypotheses, 1), strict=True):
-        for i in group:
-            term = starts[i][0]
-            moved = [
-                optimum.free.index(row)
-                for row, parameter in zip(rows[term], terms[term].parameters, strict=True)
-                if parameter.neutral == 0
-            ]
-            found[i] = _promise(optimum.gradient, optimum.fisher, moved, len(known), optimum.z[list(optimum.free)])
+                start[row] = plan.start[row] if parameter.neutral == 0 else starts[i][1].z[row]
+        hypotheses.append(Hypothesis(start, known + tuple(r for term in group for r in rows[term]), ones))
+    optima = fit(hypotheses, 1)
+    found = [UNTOLD] * len(sets)
+    for k, g in group_of.items():
+        optimum = optima[g]
+        moved = [
+            optimum.free.index(row)
+            for i in sets[k]
+            for row, parameter in zip(rows[starts[i][0]], terms[starts[i][0]].parameters, strict=True)
+            if parameter.neutral == 0
+        ]
+        found[k] = _promise(optimum.gradient, optimum.fisher, moved, len(known), optimum.z[list(optimum.free)])
     return found
 
 

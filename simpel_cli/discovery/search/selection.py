@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from simpel_cli.discovery.search.pairs import together
 from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, SHARE, TIE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects import Term
@@ -73,7 +74,7 @@ def select(
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
-    return _settled(search, grown)
+    return _settled(search, _paired(search, grown))
 
 
 def further(search: Search, found: Selection) -> Selection:
@@ -97,6 +98,19 @@ def widely(search: Search, found: Selection) -> Selection:
         others.append(beside._replace(stages=(*found.stages[:-1], *beside.stages)))  # the last one found nothing more
     best = max(others, key=lambda g: worth(g.path[-1]))
     return found if worth(best.path[-1]) < worth(found.chosen) + ASTRAY else _settled(search, best)
+
+
+def _paired(search: Search, grown: _Grown) -> _Grown:
+    """Go on with two effects at once where none pays alone, as long as that pays."""
+    while len(grown.path[-1].terms) + 2 <= MOST_EFFECTS and not search.budget.over("effects that pay only together"):
+        both = together(search, grown.path[-1])
+        if both is None:
+            break
+        risen = both.optimum.log_evidence - grown.path[-1].optimum.log_evidence
+        search.report(f"{' and '.join(search.terms[t].label for t in both.terms[-2:])} +{risen:.0f} together")
+        again = _grow(search, _path(search, both))
+        grown = again._replace(stages=(*grown.stages, *again.stages))
+    return grown
 
 
 def _settled(search: Search, grown: _Grown) -> Selection:
