@@ -18,7 +18,7 @@ size ?= small
 EXAM := --config-dir tests/exam
 
 .DEFAULT_GOAL := help
-.PHONY: help install docs demo test test-long test-recordings test-slow check lint format bench bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
+.PHONY: help install docs demo test test-long test-recordings test-slow check lint format bench benchmarks bench-discover torture sbc exam lock data real clean reproduce-metrics_vs_n_train reproduce-sinusoids reproduce-bimodal reproduce-panel-a reproduce-panel-b reproduce-offline reproduce-online bench-simulators differences
 
 help: ## Show this list
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  \033[1m%-30s\033[0m %s\n", $$1, $$2}'
@@ -78,6 +78,9 @@ format: install ## Format the code
 bench: install ## Measure scores of every method, and speed of every estimator, on the reference's arrays (needs SIMPEL_SHARED)
 	$(BIN)/python -m tests.benchmarks.reference
 	$(BIN)/python -m tests.benchmarks.speed estimators
+
+benchmarks: install ## Compare free runs with published figures and models by hand, by the benchmarks' protocol (needs SIMPEL_SHARED; OUT=DIR to go on)
+	$(BIN)/python -m tests.benchmarks.published --out $(OUT)
 
 torture: install ## Kill, starve and mislead every verb (KILLS=60 MUTATIONS=500 SEED=1 OUT=DIR); about two hours
 	$(BIN)/python -m tests.torture --kills $(KILLS) --mutations $(MUTATIONS) --seed $(SEED) --out $(OUT)

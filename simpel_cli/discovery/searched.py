@@ -19,7 +19,7 @@ from simpel_cli.discovery.search.latency import Latency, estimated, same_reading
 from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
-from simpel_cli.discovery.search.selection import Selection, cut
+from simpel_cli.discovery.search.sets.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
 from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search

@@ -9,7 +9,8 @@ from test_ranges import cart, searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.near import QUIET, far
-from simpel_cli.discovery.search.selection import Selection, select, widely
+from simpel_cli.discovery.search.sets.forward import select, widely
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import ANYWHERE, Search
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.setup import Q_BOUNDS

@@ -7,7 +7,7 @@ from test_selection import Table
 
 from simpel_cli.config.build import build
 from simpel_cli.discovery.search.budget import Budget, seconds_of
-from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.errors import ConfigError
 
 

@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal
 from test_interactions import FRICTION, NOISE, ROWS
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.selection import Selection, select
+from simpel_cli.discovery.search.sets.forward import select
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.disturbances import (
     Disturbance,

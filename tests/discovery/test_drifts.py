@@ -7,7 +7,7 @@ import pytest
 from test_ranges import cart, searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.drifts import BETWEEN, OVER, Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile

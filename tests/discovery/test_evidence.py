@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from linear_plant import LOAD, A, B, model, recording
 
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Stage, Trial
 from simpel_cli.discovery.verdict.evidence import EvidenceTable, evidence_tables
 from simpel_cli.filtering.errors_ahead import Assessor

@@ -11,7 +11,8 @@ from linear_plant import DT, LOAD, model, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
-from simpel_cli.discovery.search.selection import Selection, cut, select
+from simpel_cli.discovery.search.sets.forward import select
+from simpel_cli.discovery.search.sets.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, names_of
 from simpel_cli.discovery.search.trials import Search

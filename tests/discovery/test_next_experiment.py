@@ -15,7 +15,7 @@ from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.next_experiment.candidates import DRIVEN, FREE, Proposal, signal
 from simpel_cli.discovery.next_experiment.design import FILE, Class, Designer, class_of, next_experiment
 from simpel_cli.discovery.next_experiment.discrimination import Members, forecast
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Stage
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, setup

@@ -5,9 +5,9 @@ import pytest
 from test_ranges import cart, searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.pairs import together
 from simpel_cli.discovery.search.score_test import promises_of_sets
-from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.sets.forward import select
+from simpel_cli.discovery.search.sets.pairs import together
 from simpel_cli.discovery.search.trials import Search, asked
 from simulators.effects import Expression
 

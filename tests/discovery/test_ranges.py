@@ -8,7 +8,7 @@ import pytest
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.by_group.own_parameters import written
 from simpel_cli.discovery.search.ranges import in_words, narrowed, too_narrow, translated, widened, within
-from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.uses import FREE_RUN, suited
 from simpel_cli.discovery.verdict.beyond import beyond, ranges_of, sentence_of

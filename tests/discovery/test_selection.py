@@ -13,14 +13,17 @@ from test_disturbances import pushed
 
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import searched as searched_module
-from simpel_cli.discovery.search import acceptance, calibration, selection
+from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, proposed
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
-from simpel_cli.discovery.search.selection import cut, further, select
+from simpel_cli.discovery.search.sets import forward
+from simpel_cli.discovery.search.sets.forward import further, select
+from simpel_cli.discovery.search.sets.rivals import rivalled
+from simpel_cli.discovery.search.sets.selection import cut
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -152,7 +155,7 @@ def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
 def test_the_search_begins_with_another_effect_where_one_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     gains = {"": 0.0, "A": 30.0, "AD": 41.0, "B": 25.0, "BC": 80.0}
     assert Table(gains).chosen(beginnings=0) == "BC"  # as a pair, which makes the rest superfluous
-    monkeypatch.setattr(selection, "together", lambda *_: None)
+    monkeypatch.setattr(forward, "together", lambda *_: None)
     assert Table(gains).chosen() == "BC"
     assert Table(gains).chosen(beginnings=0) == "AD"
     assert Table(gains | {"BC": 41.0}).chosen() == "AD"  # that explains more with as many effects
@@ -274,7 +277,8 @@ def test_what_the_gate_refuses_hides_no_other_effect(
         search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log")
     )
     assert [search.terms[t].effect for t in kept.chosen.terms] == list(left)
-    assert len(judged) == len(kept.gains) == len(kept.classes) == len(left)
+    assert len(judged) == len(kept.gains) == len(left)
+    assert len(rivalled(search, kept).classes) == len(left)
     assert [search.terms[t].effect for t in without] == list(again)
 
 
@@ -372,15 +376,36 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
     none: Any = None
     search: Any = SimpleNamespace(banned=set(), budget=Budget())
     first: Any = SimpleNamespace(chosen=SimpleNamespace(terms=()))
+    monkeypatch.setattr(acceptance, "rivalled", lambda _, found: found)
     selection, gates = unwrap(accepted)(search, none, first, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]
 
 
+@pytest.mark.parametrize("refused", [False, True])
+def test_what_is_left_where_a_function_makes_an_effect_superfluous_is_judged_again(
+    refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rivals are asked of what was accepted; where that takes an effect out, the others have not been judged alone."""
+    judged: list[tuple[int, ...]] = []
+    both, one, none = (SimpleNamespace(chosen=SimpleNamespace(terms=terms)) for terms in ((1, 2), (1,), ()))
+
+    def gated(_: Any, __: Any, selection: Any, ___: Any) -> tuple[Any, list[str], list[int]]:
+        judged.append(selection.chosen.terms)
+        return (none, [], []) if selection is one and refused else (selection, ["judged"], [])
+
+    monkeypatch.setattr(acceptance, "gated_selection", gated)
+    monkeypatch.setattr(acceptance, "rivalled", lambda _, found: one if found is both else found)
+    nothing: Any = None
+    first: Any = both
+    assert unwrap(accepted)(nothing, nothing, first, nothing)[0] is (none if refused else one)
+    assert judged == [(1, 2), (1,)]
+
+
 def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     none: Any = None
     first = SimpleNamespace(chosen=1)
-    monkeypatch.setattr(acceptance, "select", lambda *_: first)
+    monkeypatch.setattr(acceptance, "selected", lambda *_: first)
     monkeypatch.setattr(acceptance, "widely", lambda _, found: (found, "anywhere"))
     monkeypatch.setattr(acceptance, "far", lambda _, __, chosen: chosen == 1)
     options: Any = SimpleNamespace(beginnings=0)

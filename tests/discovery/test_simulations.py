@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_ranges import DRAG, cart, measured, searched
 
-from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
 from simpel_cli.discovery.search.smaller import carried, names_of

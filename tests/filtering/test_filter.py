@@ -9,7 +9,7 @@ from filter_derivatives import check_derivatives
 from linear_plant import DT, LOAD, ROWS, A, B, model, recording
 from scipy.stats import multivariate_normal
 
-from simpel_cli.discovery.search.selection import select
+from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.track import Noise

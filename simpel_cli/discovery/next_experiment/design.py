@@ -27,7 +27,7 @@ from simpel_cli.discovery.next_experiment.candidates import (
     signal,
 )
 from simpel_cli.discovery.next_experiment.discrimination import Forecast, Members, forecast
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.filtering.likelihood.fit import Hypothesis

@@ -1,10 +1,13 @@
 """Which of the effects that a search has chosen are accepted on held-out episodes."""
 
 from collections.abc import Callable
+from functools import partial
 
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.near import far
-from simpel_cli.discovery.search.selection import Selection, cut, further, refused, select, widely
+from simpel_cli.discovery.search.sets.forward import further, selected, widely
+from simpel_cli.discovery.search.sets.rivals import rivalled
+from simpel_cli.discovery.search.sets.selection import Selection, cut, refused
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.interactions import interaction
@@ -29,16 +32,20 @@ def proposed(
         assessor: of errors ahead.
         base: the calibrated simulator.
         options: of the search.
-        begun: as of `select`.
+        begun: as of `selected`.
     """
-    selection = select(search, base, options.beginnings, begun)
+    selection = selected(search, base, options.beginnings, begun)
     return widely(search, selection) if far(search, assessor, selection.chosen) else selection
 
 
 def accepted(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
 ) -> tuple[Selection, list[Gate]]:
-    """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for."""
+    """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for.
+
+    The rivals are named last, of what is accepted. Where a function without a name makes an effect superfluous, the others are
+    judged without it.
+    """
     for attempt in range(MOST_SEARCHES):
         selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
         last = attempt == MOST_SEARCHES - 1 or (
@@ -49,7 +56,13 @@ def accepted(
         left, selection = selection, further(search, selection)
         if selection.chosen.terms == left.chosen.terms:
             break
-    return selection, judged
+    while True:
+        named = rivalled(search, selection)
+        if named.chosen.terms == selection.chosen.terms:
+            return named, judged
+        selection, judged, _ = gated_selection(search, assessor, named, terminal)
+        if selection.chosen.terms == named.chosen.terms:
+            return selection, judged
 
 
 def gated_selection(
@@ -68,7 +81,8 @@ def gated_selection(
     while selection.chosen.terms:
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
-        judged = gates(search, assessor, chosen, parts)
+        question = "judged", chosen.terms, *(trial.optimum.z.tobytes() for trial in (chosen, *parts))
+        judged = search.once(question, partial(gates, search, assessor, chosen, parts))
         failed = [i for i, found in enumerate(judged) if not found.passed]
         if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
             (whole,) = gates(search, assessor, chosen, [selection.base])

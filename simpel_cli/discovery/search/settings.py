@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from simpel_cli.discovery.search.budget import seconds_of
-from simpel_cli.discovery.search.selection import BEGINNINGS
+from simpel_cli.discovery.search.sets.forward import BEGINNINGS
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP
 from simpel_cli.errors import ConfigError, check_at_least_one
 from simpel_cli.filtering.errors_ahead import FIRST

@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted, proposed
 from simpel_cli.discovery.search.held_out_gate import Gate
-from simpel_cli.discovery.search.selection import Selection, worth
+from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
@@ -95,8 +95,7 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
     here = search.fitter(
         [Hypothesis(o.z, search.free(t.terms), search.ones) for t, o in zip(moved, noise, strict=True)], 1
     )
-    search.known.clear()
-    search.asked.clear()
+    search.forget()
     search.banned = simulated.banned
     search.tried += simulated.tried
     for trial, optimum in zip(moved, here, strict=True):

@@ -5,7 +5,7 @@ effects.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,9 @@ QUIETER = 0.1  # of the range of log q, than at the very start
 ANYWHERE = 3  # starts of an effect anywhere in the ranges of its parameters
 STARTS = 6  # of the model as it is
 SPREADS = (0.03, 0.1, 0.35, 1.0)  # of groups, of their largest
+
+
+Answer = TypeVar("Answer")
 
 
 def asked(effects: int) -> float:
@@ -98,7 +101,19 @@ class Search:
         self.declared: dict[str, tuple[float, float]] = {}  # ranges of parameters that are wider here than was declared
         self.banned: set[int] = set()  # terms that are no candidates
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
-        self.asked: dict[tuple[Any, ...], Stage] = {}  # what was added to what already
+        self._answers: dict[tuple[Any, ...], Any] = {}  # to what was asked already
+
+    def once(self, question: tuple[Any, ...], work: Callable[[], Answer]) -> Answer:
+        """Return what work comes to, which is not done again for the same question."""
+        if question not in self._answers:
+            self._answers[question] = work()
+        answer: Answer = self._answers[question]
+        return answer
+
+    def forget(self) -> None:
+        """Forget every fit and every answer."""
+        self.known.clear()
+        self._answers.clear()
 
     def free(self, terms: Sequence[int]) -> tuple[int, ...]:
         """Unknowns that move when these terms are there."""
@@ -224,12 +239,9 @@ class Search:
             least: nats that a start must promise to be fitted.
             widely: fit them from `anywhere`, too, whatever that promises.
         """
-        name = before.terms, before.optimum.z.tobytes(), tuple(candidates), least, widely
-        if name not in self.asked:
-            self.asked[name] = self._added(
-                before, candidates, least, self.anywhere(before, candidates) if widely else ()
-            )
-        return self.asked[name]
+        more = self.anywhere(before, candidates) if widely else ()
+        question = "added", before.terms, before.optimum.z.tobytes(), tuple(candidates), least, widely
+        return self.once(question, lambda: self._added(before, candidates, least, more))
 
     def _added(
         self, before: Trial, candidates: Sequence[int], least: float, more: Sequence[tuple[int, Hypothesis]]

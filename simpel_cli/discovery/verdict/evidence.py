@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.verdict.tables import (
     Columns,

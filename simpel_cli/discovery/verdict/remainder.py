@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
 from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift

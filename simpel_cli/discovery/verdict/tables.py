@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import before_of, interval_of
 from simpel_cli.filtering.errors_ahead import Assessment, in_parts

@@ -6,7 +6,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.held_out_gate import AHEAD, Errors, Gate, errors_of, growing
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of

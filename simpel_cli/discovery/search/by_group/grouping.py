@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
-from simpel_cli.discovery.search.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, small_search
 from simpel_cli.discovery.search.trials import ACCEPT, SPREADS, TIE, Search, Trial

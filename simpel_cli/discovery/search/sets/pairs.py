@@ -45,7 +45,7 @@ def together(search: Search, before: Trial) -> Trial | None:
             rows = search.all_rows(t)
             z[rows] = starts[i][1].z[rows]
         hypotheses.append(Hypothesis(z, search.free((*before.terms, *pairs[k])), search.ones))
-    search.tried += len(pairs)
+    search.tried += len(going)
     fits = search.fitter(hypotheses)
     trials = [search.best((*before.terms, *pairs[k]), [fit]) for k, fit in zip(going, fits, strict=True)]
     best = max(trials, key=lambda t: t.optimum.log_evidence, default=None)
