@@ -23,8 +23,9 @@ OF_A_SHAFT = ("coulomb_friction", "input_offset", "input_saturation")
 CASES = {
     "rc_car": ("rolling_resistance", "traction_limit", "tyre_slip", "input_saturation", "motor_back_emf"),
     "racecar": ("rolling_resistance", "traction_limit", "input_saturation", "input_delay", "pacejka_tyre"),
-    "oven": ("radiation", "overflow_into", "voltage_sag", "input_offset"),
-    "oven in Python": ("radiation", "overflow_into", "voltage_sag", "input_offset"),
+    "oven": ("radiation", "mutual_exchange", "voltage_sag", "input_offset"),
+    "oven in Python": ("radiation", "mutual_exchange", "voltage_sag", "input_offset"),
+    "cascaded_tanks": ("overflow_into", "outflow_exponent", "input_offset"),
     "pendulum": ("coulomb_friction", "added_inertia", "input_offset", "input_dead_zone"),
 }
 
