@@ -12,11 +12,13 @@ from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.discovery.next_experiment.design import next_experiment
+from simpel_cli.discovery.next_experiment.determining import determining_experiments
 from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentence_of
 from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
+from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.searched import Searched, latencies_of, search_of, with_latencies
 from simpel_cli.discovery.verdict.beyond import Beyond, beyond, ranges_of
 from simpel_cli.discovery.verdict.beyond import sentence_of as of_ranges
@@ -95,6 +97,11 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     if found["verdict"] == AMBIGUOUS and not search.budget.over("the next experiment"):
         terminal.line("which experiment tells them apart", "search")
         found["next_experiment"] = next_experiment(search, selection, directory)
+    options: Discovery = declared.groups.get("discovery") or Discovery()
+    opens = left_open(search, selection.chosen) if options.determine else []
+    if opens and not search.budget.over("experiments that determine what is left open"):
+        terminal.line("which experiment determines what is left open", "search")
+        found["determining_experiments"] = determining_experiments(search, selection.chosen, opens, directory)
     declared = _with_linear_inputs(declared, searched.between_rows)
     if found["effects"] or per or outside:
         found |= _correct(declared, searched, outside, found, directory, data_folder, terminal)

@@ -64,6 +64,8 @@ def show(terminal: Terminal, found: dict[str, Any], directory: Path) -> None:
     terminal.line(found["summary"], style="bold")
     if plan := found["next_experiment"]:
         terminal.line(plan["description"], "run next")
+    for plan in found.get("determining_experiments", []):
+        terminal.line(plan["description"], "determine")
     terminal.line(_table(found, directory))
     good, _ = reliable(found)
     small = " · ".join(
@@ -124,6 +126,10 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
     # a fit takes whole rows only, which the estimate seldom is
     fit = f"simpel discover{own} {what}{again}{said}          # the same, with the latency that was found"
     lines.append(fit if late else f"simpel fit{own} {what}{said}          # with the declared simulator")
+    if found.get("not_determined") and not found.get("determining_experiments"):
+        lines.append(
+            f"simpel discover{own} {what} discovery.determine=true          # which input determines what is left open"
+        )
     if found["verdict"] in ("unexplained", "ambiguous"):
         lines.append(f"simpel discover{own} {what} 'effect=[all,my_effect]'          # with an effect of your own")
     return lines

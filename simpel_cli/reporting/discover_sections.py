@@ -54,6 +54,7 @@ def sections_of(
         coverage_section(tables.get("coverage", {})),
         check_section(found),
         next_section(found) | {k: following[k] for k in ("image", "width") if k in following},
+        determining_section(found),
     ]
     return [part for part in parts if part]
 
@@ -385,3 +386,15 @@ def next_section(found: Mapping[str, Any]) -> Section:
         else ""
     )
     return {"title": "Next experiment", "note": plan["description"], "head": head, "rows": rows, "after": after}
+
+
+def determining_section(found: Mapping[str, Any]) -> Section:
+    """Experiments that determine what the data leave open of the simulator's parameters."""
+    plans = found.get("determining_experiments") or []
+    rows = [(plan["combination"], plan["description"], plan["file"] or "") for plan in plans]
+    head = ("left open by these data", "what to do", "file")
+    return (
+        {"title": "Experiments that determine what is left open", "head": head, "rows": rows, "text": True}
+        if rows
+        else {}
+    )

@@ -83,15 +83,19 @@ def next_experiment(search: Search, selection: Selection, directory: Path) -> di
     tied = class_of(search, selection)
     if not tied.pairs:
         return None
-    designer = Designer(search, tied)
-    best = designer.best()
+    return designed(search, tied, directory / FILE)
+
+
+def designed(search: Search, tied: Class, file: Path) -> dict[str, Any]:
+    """Find the episode that distinguishes the members of a class, write it as CSV and return what the verdict says of it."""
+    best = Designer(search, tied).best()
     if best is None:
         names = " and ".join(_words(n) for n in tied.names)
         text = f"No episode was found that distinguishes {names} and keeps all states within their declared ranges."
         nothing: dict[str, Any] = {"file": None, "start": None, "kind": None, "seconds": 0.0, "units": {}, "pairs": []}
         return nothing | {"expected_log_likelihood_ratio": 0.0, "description": text}
-    found = _verdict(search, tied, best)
-    write_text(directory / FILE, _csv(search, tied, best, found))
+    found = _verdict(search, tied, best, file.name)
+    write_text(file, _csv(search, tied, best, found))
     return found
 
 
@@ -220,7 +224,7 @@ def members_of(search: Search, trials: Sequence[Trial]) -> Members:
     return Members(p, noise.r[:, 0], noise.q, jnp.asarray(weight))
 
 
-def _verdict(search: Search, tied: Class, best: Design) -> dict[str, Any]:
+def _verdict(search: Search, tied: Class, best: Design, file: str) -> dict[str, Any]:
     model = search.plan.augmented.model
     start = {q.name: float(v) for q, v in zip(model.states, best.proposal.start, strict=True)}
     pairs = [
@@ -228,7 +232,7 @@ def _verdict(search: Search, tied: Class, best: Design) -> dict[str, Any]:
         for i, j in tied.pairs
     ]
     found = {
-        "file": FILE,
+        "file": file,
         "start": start,
         "kind": best.proposal.kind,
         "seconds": len(best.inputs) * model.dt,
@@ -236,10 +240,10 @@ def _verdict(search: Search, tied: Class, best: Design) -> dict[str, Any]:
         "expected_log_likelihood_ratio": best.least,
         "pairs": pairs,
     }
-    return found | {"description": _sentence(search, tied, best)}
+    return found | {"description": _sentence(search, tied, best, file)}
 
 
-def _sentence(search: Search, tied: Class, best: Design) -> str:
+def _sentence(search: Search, tied: Class, best: Design, file: str) -> str:
     """Return what to do, for how long, and the expected gain in log evidence."""
     model = search.plan.augmented.model
     seconds = f"{len(best.inputs) * model.dt:.3g} s"
@@ -253,8 +257,8 @@ def _sentence(search: Search, tied: Class, best: Design) -> str:
     )
     i, j = min(tied.pairs, key=lambda pair: best.ratio[pair])
     names = f"{_words(tied.names[i])} and {_words(tied.names[j])}"
-    others = " (more for any other pair of causes)" if len(tied.names) > 2 else ""
-    doing = f"the {seconds} {best.proposal.kind} of {FILE} from {start}" + (f" ({spans})" if spans else "")
+    others = " (more for any other pair)" if len(tied.names) > 2 else ""
+    doing = f"the {seconds} {best.proposal.kind} of {file} from {start}" + (f" ({spans})" if spans else "")
     if best.least >= TIE:
         return f"Run {doing}. Expected gain in log evidence between {names}: {best.least:.0f} nats{others}."
     least = max(best.least, 0.0)

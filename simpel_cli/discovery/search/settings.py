@@ -31,6 +31,7 @@ class Discovery:
         simulations: whether a second search takes every episode for one simulation, whose remainder has a memory; what it
             finds is chosen where it is worth more. It takes as long again, and may take what differs from group to group for
             effects.
+        determine: whether an experiment is designed that determines what the data leave open of the simulator's parameters.
         budget: how long the search may take, s (60, `60s`, `2min`): what is worth most comes first, and the verdict says what
             was left out. What has begun is ended, and the report comes on top. Null: as long as it takes.
     """
@@ -45,6 +46,7 @@ class Discovery:
     beginnings: int = BEGINNINGS
     for_: str | float | None = None
     simulations: bool = False
+    determine: bool = False
     budget: str | float | None = None
 
     def __post_init__(self) -> None:

@@ -102,6 +102,7 @@ def verdict_of(
         "not_found": _not_found(search, selection),
         "data_checks": [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in checks],
         "next_experiment": None,
+        "determining_experiments": [],
         "corrected_sim": None,
         "candidates_tried": search.tried,
         "seconds": round(seconds, 2),
