@@ -29,6 +29,7 @@ from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.measurements.cleaning import Cleaned
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
 
@@ -304,17 +305,25 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     test = real.plan.windows._replace(begin=real.plan.windows.begin + 1)
     none_left = np.zeros_like(test.ok)
     data = Recording((), (), (), {}, (), (), ())
+    seen: list[tuple[bool, Any]] = []
+
+    def begun(_: Any, __: Any, windows: Windows, rows: int | None) -> Windows:
+        seen.append((windows is test, rows))
+        return windows
+
     for name, stub in {
         "whole_windows": lambda *_: test,
-        "begun": lambda _, __, windows, *___: windows,
+        "begun": begun,
         "gated": lambda _, __, windows: windows._replace(ok=none_left) if windows.begin[0] else windows,
         "without_new": lambda clean, _, after, __: (clean, after),
         "Search": lambda *_: table.search,
     }.items():
         monkeypatch.setattr(calibration, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
-    plan = real.plan._replace(spare=test)
-    found = calibrated(plan, real.fitter, Assessor(real.plan, 5), Cleaned(data, (), {}), terminal)
+    plan = real.plan._replace(spare=test._replace(begin=test.begin + 1))
+    found = calibrated(plan, real.fitter, Assessor(real.plan, 5, 7), Cleaned(data, (), {}), terminal)
+    assert {rows for of_test, rows in seen[:3] if of_test} == {7}  # of a test its first rows alone
+    assert {rows for of_test, rows in seen[:3] if not of_test} == {None}
     np.testing.assert_array_equal(found.test.ok, none_left)
     np.testing.assert_array_equal(found.search.plan.spare.ok, none_left)  # what is held out to judge effects
 
