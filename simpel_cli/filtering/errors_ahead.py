@@ -19,6 +19,7 @@ BLOCKS = 10  # of a test window, where there are few episodes
 RAN_AWAY = 1e3  # times the other model's error, where a model has none
 SETTLE = 5  # rows after which the filter knows a state that it started without
 FIRST = 6  # rows from which it is estimated where a free run begins
+SHORT = 4  # times the rows that tell the first state: a window that is shorter begins sooner
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -57,21 +58,26 @@ class Assessor:
 
     def __init__(self, plan: Setup, horizon: int, first: int = FIRST) -> None:
         self.plan, self.horizon, self.first = plan, horizon, first
-        self._program = _program(plan.rule, plan.coordinates.layout, horizon, first)
 
     def of(self, plan: Setup, horizon: int | None = None) -> "Assessor":
         """Return the same for models of another setup, or so many rows ahead."""
         return Assessor(plan, self.horizon if horizon is None else horizon, self.first)
 
+    def first_of(self, windows: Windows) -> int:
+        """Return the rows that tell a first state: of windows that are short for that, no more than a quarter."""
+        return min(self.first, max(FIRST, windows.y.shape[1] // SHORT))
+
     def __call__(self, z: np.ndarray, windows: Windows) -> Assessment:
         """Assess the model at unit coordinates z."""
+        first = self.first_of(windows)
+        program = _program(self.plan.rule, self.plan.coordinates.layout, self.horizon, first)
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
         count, batch = len(windows.episode), len(self.plan.windows.episode)
         if windows.y.shape[1] != self.plan.windows.y.shape[1]:
             batch = min(batch, count)
         # batches of one size: windows to learn from and to test on share a program where they are equally long
         parts = [
-            self._program(bounds, jnp.asarray(z), *(a[np.arange(i, i + batch) % count] for a in windows.arrays))
+            program(bounds, jnp.asarray(z), *(a[np.arange(i, i + batch) % count] for a in windows.arrays))
             for i in range(0, count, batch)
         ]
         track, ahead, free = jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
@@ -79,11 +85,11 @@ class Assessor:
         e, s = track.innovation * ok, track.variance
         log_likelihood = -0.5 * np.nansum(np.log(s) * ok + e**2 / s + LOG_2PI * ok, axis=(1, 2))
         alone = self._wrapped(windows.y - free) * ok
-        alone[:, : self.first] = np.nan
+        alone[:, :first] = np.nan
         horizon = self._wrapped(windows.y - ahead) * ok
         horizon[:, : SETTLE + self.horizon] = np.nan
         e[:, :SETTLE] = np.nan
-        return Assessment(e, s, horizon, alone, log_likelihood, free, track, self.first)
+        return Assessment(e, s, horizon, alone, log_likelihood, free, track, first)
 
     def free_runs(self, z: np.ndarray, windows: Windows) -> np.ndarray:
         """Return the errors of free runs of several models at once, (models, W, T, ny), as `free` of an assessment.
@@ -94,12 +100,12 @@ class Assessor:
         """
         bounds = tuple(jnp.asarray(a) for a in self.plan.coordinates.bounds)
         free = np.asarray(
-            _free_program(self.plan.rule, self.plan.coordinates.layout, self.first)(
+            _free_program(self.plan.rule, self.plan.coordinates.layout, self.first_of(windows))(
                 bounds, jnp.asarray(z), *windows.arrays
             )
         )
         error = self._wrapped(windows.y - free) * np.where(windows.ok > 0, 1.0, np.nan)
-        error[:, :, : self.first] = np.nan
+        error[:, :, : self.first_of(windows)] = np.nan
         return error
 
     def track(self, z: np.ndarray, windows: Windows) -> Track:

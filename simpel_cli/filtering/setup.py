@@ -14,7 +14,7 @@ from simpel_cli.filtering.likelihood.remainders import remainders_of
 from simpel_cli.filtering.likelihood.track import Filter
 from simpel_cli.filtering.measurements import windows as windows_
 from simpel_cli.filtering.measurements.integration_steps import substeps_needed
-from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, thinned, windows_of
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, padded, thinned, windows_of
 from simulators.effects import Expression, Scales, Term, unnamed
 from simulators.effects.term import (
     BACKLASH,
@@ -33,6 +33,7 @@ MOST_SPARE = 4  # times the rows of a search: windows that are held out for free
 Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
+MOST_PADDED = 4  # times the rows that windows of one length may have in all
 MOST_GROUPED = 2  # effects that differ between groups and act at once
 UNKNOWN_NOISE = 0.01  # of a channel's magnitude, where its noise begins if nothing tells it
 PLAY_ROWS = (
@@ -244,10 +245,15 @@ def _declared_rates(model: Model, states: np.ndarray, inputs: np.ndarray) -> np.
 def whole_windows(
     plan: Setup, episodes: Sequence[Episode], outputs: Sequence[str], longest: int | None = None
 ) -> Windows:
-    """Cut episodes into windows like those of the search, each as long as its episode, or as `longest` (`LONGEST_RUN`)."""
-    model = plan.augmented.model
+    """Cut episodes into windows like those of the search, each as long as its episode, or as `longest` (`LONGEST_RUN`).
+
+    Windows are equally long: beside many short episodes a very long one is cut, so that not most of them is padding.
+    """
+    model, longest = plan.augmented.model, longest or windows_.LONGEST_RUN
+    while longest > windows_.LONGEST_RUN and padded([len(e.time) for e in episodes], longest) > MOST_PADDED:
+        longest //= 2
     return windows_of(
         episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
         lead=plan.lead, dt=model.dt, clocked=plan.clocked,
-        longest=longest or windows_.LONGEST_RUN,
+        longest=longest,
     )  # fmt: skip

@@ -126,7 +126,7 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
     # a fit takes whole rows only, which the estimate seldom is
     fit = f"simpel discover{own} {what}{again}{said}          # the same, with the latency that was found"
     lines.append(fit if late else f"simpel fit{own} {what}{said}          # with the declared simulator")
-    if found.get("not_determined") and not found.get("determining_experiments"):
+    if found.get("not_determined") and not (config.get("discovery") or {}).get("determine"):
         lines.append(
             f"simpel discover{own} {what} discovery.determine=true          # which input determines what is left open"
         )

@@ -23,7 +23,7 @@ def compared(run: Path) -> dict[str, Any]:
     kept = run / KEPT
     if not kept.exists():
         config, verdict = (yaml.safe_load((run / name).read_text()) for name in ("config.yaml", "verdict.json"))
-        if "corrected_sim" not in verdict:
+        if not verdict["corrected_sim"]:
             raise SystemExit(f"{run}: verdict {verdict['verdict']}, no corrected simulator")
         (data,) = (run / "conf" / "data").glob("*.yaml")
         declared = declare(config | {"data": yaml.safe_load(data.read_text())}).without("effect", "discovery")

@@ -8,6 +8,7 @@ import pytest
 from test_ranges import searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.next_experiment import design, determining
 from simpel_cli.discovery.next_experiment.design import HOPELESS
 from simpel_cli.discovery.next_experiment.determining import determining_experiments, ends_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
@@ -78,6 +79,8 @@ def test_what_the_equations_leave_open_no_input_determines(tmp_path: Path) -> No
     (found,) = determining_experiments(search, base, [one], tmp_path)
     assert found["expected_log_likelihood_ratio"] < HOPELESS
     assert found["description"].startswith("No admissible input determines")
+    assert found["file"] is None
+    assert list(tmp_path.iterdir()) == []
     ends = ends_of(search, base, one)
     assert ends is not None
     rows = {q.name: i for i, q in enumerate(search.plan.augmented.params)}
@@ -87,6 +90,22 @@ def test_what_the_equations_leave_open_no_input_determines(tmp_path: Path) -> No
     assert values[1][0] > 1.2 * values[0][0] or values[1][1] > 1.2 * values[0][1]
     for k, m in values:
         assert k / m == pytest.approx(GAIN, rel=0.02)
+
+
+def test_where_no_episode_is_admissible_nothing_is_said_of_inputs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = cart("b*u - c*v", b={"unit": "m/s^2/V", "range": [0.5, 2]}, c={"unit": "1/s", "range": [0.2, 1]})
+    search, base = calibrated(model, 0.0)
+    (one,) = left_open(search, base)
+    monkeypatch.setattr(design.Designer, "best", lambda _: None)
+    (found,) = determining_experiments(search, base, [one], tmp_path)
+    assert found["description"].startswith("No episode was found")
+    monkeypatch.setattr(determining, "ends_of", lambda *_: None)
+    (found,) = determining_experiments(search, base, [one], tmp_path)
+    assert found["description"] == "No two models that differ in b were found to explain these data alike."
+    assert found["file"] is None
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_determined_has_no_ends(tmp_path: Path) -> None:

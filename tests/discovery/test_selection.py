@@ -22,6 +22,7 @@ from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward
 from simpel_cli.discovery.search.sets.forward import further, select
+from simpel_cli.discovery.search.sets.merging import merged
 from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import cut
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
@@ -143,6 +144,20 @@ def test_every_further_effect_has_to_earn_more() -> None:
     assert Table({"": 0, "A": 30, "AB": 30 + enough}).chosen() == "AB"
     assert Table({"": 0, "A": 30, "AB": 30 + ACCEPT + 0.1}).chosen() == "A"
     assert Table({"": 0, "A": ACCEPT + 0.1}).chosen() == "A"
+
+
+def test_what_did_harm_takes_no_place_of_two() -> None:
+    """What could stand for two effects is asked again after it was refused: memory would bring it back for ever."""
+    gains = {"": 0.0, "A": 20.0, "E": 15.0, "D": 14.0, "AB": 40.0, "AD": 35.0, "ABD": 61.0, "DE": 60.0}
+    search = Table(gains).search
+    terms = {term.effect: t for t, term in enumerate(search.terms)}
+    chosen = search.part(search.base(), tuple(terms[name] for name in "ABD"))
+    stage = merged(search, chosen)
+    assert stage is not None
+    assert stage.trials[0].terms[-1] == terms["E"]
+    assert merged(search, chosen) is stage
+    search.banned.add(terms["E"])
+    assert merged(search, chosen) is None
 
 
 def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
@@ -321,8 +336,8 @@ def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
         monkeypatch.setattr(calibration, name, stub)
     terminal = Terminal(True, tmp_path / "run.log")
     plan = real.plan._replace(spare=test._replace(begin=test.begin + 1))
-    found = calibrated(plan, real.fitter, Assessor(real.plan, 5, 7), Cleaned(data, (), {}), terminal)
-    assert {rows for of_test, rows in seen[:3] if of_test} == {7}  # of a test its first rows alone
+    found = calibrated(plan, real.fitter, Assessor(real.plan, 5, 5), Cleaned(data, (), {}), terminal)
+    assert {rows for of_test, rows in seen[:3] if of_test} == {5}  # of a test its first rows alone
     assert {rows for of_test, rows in seen[:3] if not of_test} == {None}
     np.testing.assert_array_equal(found.test.ok, none_left)
     np.testing.assert_array_equal(found.search.plan.spare.ok, none_left)  # what is held out to judge effects

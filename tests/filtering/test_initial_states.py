@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.filtering.errors_ahead import FIRST as FEWEST
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun, moved
-from simpel_cli.filtering.setup import Setup, setup
+from simpel_cli.filtering.measurements.windows import LONGEST_TEST, padded
+from simpel_cli.filtering.setup import Setup, setup, whole_windows
 from simulators.model import Declared
 
 DT, ROWS, EMPTIES, FIRST = 1.0, 40, 0.3, (20.0, 45.0, 70.0, 95.0)
@@ -81,3 +83,22 @@ def test_of_a_free_run_only_its_first_rows_are_seen(plan: Setup) -> None:
     alone = assessor.free_runs(plan.start[None], first)[0]
     np.testing.assert_allclose(alone[:, 8:], found.free[:, 8:], rtol=1e-6, atol=1e-9)
     assert assessor.of(plan, 3).first == 8
+    long = Assessor(plan, 5, 30)  # of windows of 40 rows a quarter
+    assert long.first_of(first) == ROWS // 4 if first.y.shape[1] == ROWS else FEWEST
+    assert np.isfinite(long(plan.start, first).free).any()
+
+
+def test_beside_short_episodes_a_long_one_is_cut(plan: Setup) -> None:
+    """Windows are equally long: of one long episode and many short ones most would be padding."""
+    assert padded([5000], LONGEST_TEST) == 1
+    assert padded([6000] + 20 * [300], LONGEST_TEST) == pytest.approx(21 * 6000 / 12000)
+
+    def of(rows: int) -> Episode:
+        return Episode("e", np.arange(rows) * DT, np.full((rows, 2), 10.0), np.zeros((rows, 0)), np.zeros((rows, 0)))
+
+    whole = whole_windows(plan, [of(6000)], (), LONGEST_TEST)
+    assert whole.y.shape[:2] == (1, 6000)
+    cut = whole_windows(plan, [of(6000), *(of(300) for _ in range(20))], (), LONGEST_TEST)
+    assert cut.y.shape[1] < 6000
+    assert cut.y.shape[0] * cut.y.shape[1] <= 4.5 * 12000
+    assert whole_windows(plan, [of(6000)], ()).y.shape[:2] == (3, 2000)

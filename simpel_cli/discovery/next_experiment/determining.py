@@ -39,15 +39,22 @@ def determining_experiments(
     """
     found = []
     for k, one in enumerate(opens[:MOST]):
-        ends = ends_of(search, chosen, one)
+        ends, what = ends_of(search, chosen, one), one.words.partition(":")[0]
         if ends is None:
+            text = f"No two models that differ in {what} were found to explain these data alike."
+            found.append(
+                {"combination": one.words, "file": None, "expected_log_likelihood_ratio": 0.0, "description": text}
+            )
             continue
-        plan = designed(search, ends, directory / FILE.format(f"_{k + 1}" if k else ""))
-        if plan["expected_log_likelihood_ratio"] < HOPELESS:
+        file = directory / FILE.format(f"_{k + 1}" if k else "")
+        plan = designed(search, ends, file)
+        if plan["file"] and plan["expected_log_likelihood_ratio"] < HOPELESS:
             first, second = ends.names
+            file.unlink()  # an episode like all others
+            plan["file"] = None
             plan["description"] = (
-                f"No admissible input determines {one.words.partition(':')[0]}: models with {first} and with {second} predict "
-                "the same measurements. Measure something else, or declare one of the parameters."
+                f"No admissible input determines {what}: models with {first} and with {second} predict the same measurements. "
+                "Measure something else, or declare one of the parameters."
             )
         found.append({"combination": one.words, **plan})
     return found
@@ -61,6 +68,9 @@ def ends_of(search: Search, chosen: Trial, one: Open) -> Class | None:
     sd = float(np.asarray(plan.coordinates.sd_of_prior())[row])
     far = sd if np.isfinite(sd) else 1 / np.sqrt(12)
     free = tuple(i for i in optimum.free if i != row)
+    # along such a combination a fit creeps: the chosen model may be a little short of its optimum
+    again = search.fitter([Hypothesis(search.loud(optimum.z), optimum.free, search.ones)])
+    best = min(o.loss for o in (optimum, *again) if np.isfinite(o.loss))
     for halving in range(HALVINGS + 1):
         at = [float(np.clip(optimum.z[row] + side * far / 2**halving, NEARLY, 1 - NEARLY)) for side in (-1, 1)]
         if at[1] - at[0] < LEAST:
@@ -71,7 +81,10 @@ def ends_of(search: Search, chosen: Trial, one: Open) -> Class | None:
             z[row] = value
             starts.append(Hypothesis(z, free, search.ones))
         fits = search.fitter(starts)
-        if all(fit.loss < optimum.loss + ALIKE for fit in fits):
-            labels = [f"{names[row]}={plan.coordinates.value(row, value):.3g}" for value in at]
+        best = min([best, *(fit.loss for fit in fits if np.isfinite(fit.loss))])
+        if all(fit.loss < best + ALIKE for fit in fits):
+            values = [plan.coordinates.value(row, value) for value in at]
+            digits = next(n for n in range(3, 18) if f"{values[0]:.{n}g}" != f"{values[1]:.{n}g}")
+            labels = [f"{names[row]}={value:.{digits}g}" for value in values]
             return Class(tuple(Trial(chosen.terms, fit) for fit in fits), tuple(labels), ((0, 1), (1, 0)))
     return None

@@ -117,7 +117,7 @@ def calibrated(plan: Setup, fitter: Fitter, assessor: Assessor, clean: Cleaned, 
     if plan.spare is not None:
         raw["spare"] = plan.spare
     # what a free run of the test may begin with is what its first rows tell
-    seen = {"test": assessor.first}
+    seen = {"test": assessor.first_of(raw["test"])}
     cut = {split: begun(assessor, plan.start, windows, seen.get(split)) for split, windows in raw.items()}
     report = lambda text: terminal.line(text, "search")  # noqa: E731
     for _ in range(MOST_CALIBRATIONS):

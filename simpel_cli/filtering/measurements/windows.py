@@ -107,9 +107,7 @@ def windows_of(
         at_least: windows per episode, so that few episodes can be held out in parts.
         longest: rows of a window.
     """
-    rows_of_longest = max(len(e.time) for e in episodes)
-    pieces = max(at_least, -(-rows_of_longest // longest))
-    length = -(-rows_of_longest // pieces)
+    length = _length([len(e.time) for e in episodes], longest, at_least)
     rows: dict[str, list[np.ndarray]] = {
         "y": [],
         "ok": [],
@@ -161,6 +159,18 @@ def windows_of(
             "longer episodes, or choose others to test on (data.split)."
         )
     return Windows(*(np.stack(rows[name]) for name in Windows._fields))
+
+
+def padded(rows: Sequence[int], longest: int) -> float:
+    """Return how many times the rows of episodes their windows have, padding included."""
+    length = _length(rows, longest)
+    return sum(-(-n // length) for n in rows) * length / sum(rows)
+
+
+def _length(rows: Sequence[int], longest: int, at_least: int = 1) -> int:
+    """Return the rows of a window: the longest episode in equal pieces."""
+    pieces = max(at_least, -(-max(rows) // longest))
+    return -(-max(rows) // pieces)
 
 
 def clocked(episodes: Sequence[Episode], dt: float) -> bool:

@@ -151,7 +151,13 @@ def _asked(
 
         return Question(Grouping("", by, 0.0, None, pays=False, parameter=name), trials)
 
-    return judged(small, Assessor(small.plan, options.horizon), alike, [question(name) for name in names], most)
+    return judged(
+        small,
+        Assessor(small.plan, options.horizon, options.first_rows),
+        alike,
+        [question(name) for name in names],
+        most,
+    )
 
 
 def _differing(small: Search, at: Trial, spread: int) -> Trial:

@@ -21,7 +21,8 @@ def merged(search: Search, chosen: Trial) -> Stage | None:
     pairs = list(combinations(chosen.terms, 2))
     if not pairs or search.budget.over("one effect in place of two"):
         return None
-    return search.once(("merged", chosen.terms, chosen.optimum.z.tobytes()), lambda: _merged(search, chosen, pairs))
+    question = "merged", chosen.terms, chosen.optimum.z.tobytes(), frozenset(search.banned)
+    return search.once(question, lambda: _merged(search, chosen, pairs))
 
 
 def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stage | None:
