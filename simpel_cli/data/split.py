@@ -27,10 +27,10 @@ def assign(config: Measurements, table: Table, rows: Rows, dynamic: bool, seed: 
     detail = ""
     if "column" in config.split:
         label = split_labels(config, table, config.split["column"])[rows.number]
+        _refuse_alternation(config.split["column"], rows, label, dynamic)
         if "test" in config.split:
             named = np.isin(label, list(config.split["test"]))
             label = np.where(named, "test", np.where(label == "test", "unused", label))
-        _refuse_alternation(config.split["column"], rows, label, dynamic)
     elif config.all_train:
         label = np.full(len(rows.episode), "train")
         detail = "everything is trained on, nothing is kept to test on"

@@ -38,16 +38,12 @@ class Benchmark(NamedTuple):
 
     Args:
         experiment: that is searched.
-        part: as `specialists` calls it.
-        episode: of the test; None: all of them.
-        rows: of it that count; None: all.
+        part: of the test, as `specialists` calls it; `all`.
         published: by others, in the unit of `specialists`.
     """
 
     experiment: str
     part: str
-    episode: str | None = None
-    rows: int | None = None
     published: tuple[Figure, ...] = ()
 
 
@@ -65,11 +61,11 @@ TANKS = (
 )
 BENCHMARKS = (
     Benchmark("cascaded_tanks", "all", published=TANKS),
-    Benchmark("silverbox", "test_multisine", "test_multisine", None,
+    Benchmark("silverbox", "test_multisine",
               (Figure("GRU", 1.49, CHAMPNEYS), Figure("LSTM", 1.51, CHAMPNEYS))),
-    Benchmark("silverbox", "test_arrow", "test_arrow", None,
+    Benchmark("silverbox", "test_arrow",
               (Figure("GRU", 2.80, CHAMPNEYS), Figure("LSTM", 2.38, CHAMPNEYS))),
-    Benchmark("silverbox", "test_arrow, its first 32000 rows", "test_arrow", 32_000,
+    Benchmark("silverbox", "test_arrow, its first 32000 rows",
               (Figure("GRU", 0.95, CHAMPNEYS), Figure("LSTM", 1.08, CHAMPNEYS))),
     Benchmark("emps", "all"),
     Benchmark("tclab", "all"),
@@ -78,36 +74,39 @@ BENCHMARKS = (
 )  # fmt: skip
 
 
-def free_run(run: Path, output: str, benchmark: Benchmark, model: str) -> float:
-    """Return the root mean square of the error of a free run, in the unit of the data.
+def free_run(run: Path, output: str, span: tuple[float, float], model: str) -> float:
+    """Return the root mean square of the error of a free run, in the unit of the data; inf where it ran away.
 
     Args:
         run: directory of a search.
         output: that was measured.
-        benchmark: which part of the test counts.
+        span: times of the test that count, s.
         model: `before` or `after`.
     """
     table = pd.read_parquet(run / "trajectories.parquet")
-    table = table[(table["output"] == output) & table["free"]]
-    if benchmark.episode is not None:
-        table = table[table["episode"].astype(str).str.contains(benchmark.episode)]
-    if benchmark.rows is not None:
-        table = table[table["row"] < benchmark.rows]
+    inside = (table["time"] >= span[0]) & (table["time"] <= span[1])
+    table = table[(table["output"] == output) & table["free"] & inside & table["measured"].notna()]
     if table.empty:
-        raise SystemExit(f"{run}: no test rows of {benchmark.episode}; remove it, or choose another --out")
-    error = (table["measured"] - table[model])[table["measured"].notna()].to_numpy()
-    return float(np.sqrt(np.mean(error**2))) if np.isfinite(error).all() else np.inf  # it ran away
+        raise SystemExit(
+            f"{run}: no test rows of {output} in {span[0]:g}..{span[1]:g} s; remove it, or choose another --out"
+        )
+    error = (table["measured"] - table[model]).to_numpy()
+    return float(np.sqrt(np.mean(error**2))) if np.isfinite(error).all() else np.inf
 
 
 def row(benchmark: Benchmark, run: Path, hand: np.ndarray, verdict: str, cost: str) -> list[str]:
     """Return the table's rows of a benchmark, one per output."""
     rig = RIGS[benchmark.experiment](Path(os.environ["SIMPEL_SHARED"]))
+    whole = benchmark.part == "all"
+    time = np.array([-np.inf, np.inf]) if whole else rig.test[benchmark.part].time
     lines = []
     for j, output in enumerate(rig.outputs):
-        before, after = (rig.scale[0] * free_run(run, output, benchmark, model) for model in ("before", "after"))
+        before, after = (
+            rig.scale[0] * free_run(run, output, (time[0], time[-1]), model) for model in ("before", "after")
+        )
         near = "yes" if after <= NEAR * hand[j] else "no"
         others = "; ".join(f"{f.method} {f.value:g}" for f in benchmark.published) or "-"
-        part = "" if benchmark.part == "all" else f", {benchmark.part}"
+        part = "" if whole else f", {benchmark.part}"
         lines.append(
             f"| {benchmark.experiment}{part}, {output} | {rig.first} | {rig.scale[1]} | {before:.3g} | {after:.3g} "
             f"| {hand[j]:.3g} | {near} | {others} | {verdict} | {cost} |"

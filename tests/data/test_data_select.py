@@ -74,6 +74,15 @@ def test_a_split_inside_an_episode_may_cut_it_once_but_not_alternate(tmp_path: P
         read_rows(tmp_path, lambda _, i: "train" if i % 2 else "test", split={"column": "part"})
 
 
+def test_two_tests_may_lie_on_either_side_of_what_is_trained_on(tmp_path: Path) -> None:
+    def part(_: int, i: int) -> str:
+        return "arrow" if i < 3 else "train" if i < 7 else "sine"
+
+    recording = read_rows(tmp_path, part, split={"column": "part", "test": ["arrow", "sine"]})
+    assert sorted({len(e.time) for e in recording.train}) == [4]
+    assert sorted({len(e.time) for e in recording.test}) == [3]
+
+
 def test_an_empty_split_and_a_single_episode_are_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="the test split is empty") as error:
         read_rows(tmp_path, lambda run, _: "train", split={"column": "part"})
