@@ -245,3 +245,13 @@ def test_equations_in_python_show_what_was_added() -> None:
         "throttle acts as a*throttle",
     ]
     assert [new["lines"][k][0][1] for k in (1, 2)] == [False, True]  # the delay was there before
+
+
+def test_of_a_long_course_the_last_swings_are_shown() -> None:
+    time = np.arange(5000) / 10
+    fast, slow = np.sin(2 * np.pi * time), np.sin(2 * np.pi * time / 100)
+    begin = discover_runs.last_swings(fast)
+    assert np.sum(np.diff(np.sign(fast[begin:])) != 0) == pytest.approx(discover_runs.MOST_SWINGS, abs=1)
+    noisy = slow + 0.1 * np.random.default_rng(0).normal(size=len(time))
+    assert discover_runs.last_swings(noisy) == 0
+    assert discover_runs.last_swings(np.full(9, np.nan)) == discover_runs.last_swings(np.ones(9)) == 0

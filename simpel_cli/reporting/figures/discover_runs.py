@@ -19,6 +19,7 @@ from simpel_cli.reporting.figures.canvas import (
 from simpel_cli.runs.files import read_columns
 
 STYLE = {"before": (COLOURS[1], "calibrated simulator", "--"), "after": (COLOURS[0], "corrected simulator", "-")}
+MOST_SWINGS = 60  # that a reader can tell apart
 HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
 
 
@@ -28,15 +29,17 @@ def models_of(found: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def draw_traces(found: dict[str, Any], path: Path) -> Any:
-    """Draw measured values and free runs of the test episode whose error after is the median of all."""
+    """Draw measured values and free runs of the test episode whose error after is the median of all; of a long one the end."""
     table = read_columns(path)
     if not len(table["episode"]):
         return None
     episode = typical_episode(table)
     outputs = distinct(table["output"])
     figure, axes = new_figure(len(outputs), 9.4, 2.1, columns=1)
+    shown = [table["measured"][(table["episode"] == episode) & (table["output"] == output)] for output in outputs]
+    begin = max(last_swings(values) for values in shown)
     for axis, output in zip(axes, outputs, strict=True):
-        own = {n: c[(table["episode"] == episode) & (table["output"] == output)] for n, c in table.items()}
+        own = {n: c[(table["episode"] == episode) & (table["output"] == output)][begin:] for n, c in table.items()}
         axis.plot(own["time"], own["measured"], ".", color=BLACK, markersize=3, label="measured")
         free = np.where(own["free"], 1.0, np.nan)
         for model in models_of(found):
@@ -44,10 +47,20 @@ def draw_traces(found: dict[str, Any], path: Path) -> Any:
             axis.plot(own["time"], own[model] * free, dash, color=colour, linewidth=1.3, label=label)
         _around(axis, own, models_of(found))
         axis.set(ylabel=with_unit(output, own["unit"][0]))
-    axes[0].set_title(f"test episode {episode}", fontsize=9, loc="left")
+    part = f", its last {len(shown[0]) - begin} of {len(shown[0])} rows" if begin else ""
+    axes[0].set_title(f"test episode {episode}{part}", fontsize=9, loc="left")
     axes[-1].set_xlabel("time [s]")
     legend_below(figure, axes[0])
     return figure
+
+
+def last_swings(values: np.ndarray) -> int:
+    """Return the row from which a course has no more than `MOST_SWINGS` swings through its middle left."""
+    low, high = np.nanquantile(values, [0.05, 0.95]) if np.isfinite(values).any() else (0.0, 0.0)
+    off = values - (low + high) / 2
+    there = np.flatnonzero(np.abs(off) > 0.2 * (high - low))  # noise about the middle is no swing
+    turns = there[1:][np.diff(np.sign(off[there])) != 0]
+    return int(turns[-MOST_SWINGS]) if len(turns) > MOST_SWINGS else 0
 
 
 def typical_episode(table: dict[str, np.ndarray]) -> Any:
