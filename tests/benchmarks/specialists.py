@@ -20,8 +20,6 @@ from scipy.optimize import least_squares
 
 Rates: TypeAlias = Callable[[Any, Any, Any], Any]  # (x, u, p) -> dx/dt, of arrays whose last axis is the state
 
-PIECES = 0.1  # share of the rows that a first guess of many unknowns may need at least
-
 
 class Run(NamedTuple):
     """One episode: times (T,), inputs (T, nu), measured (T, ny)."""

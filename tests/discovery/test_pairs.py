@@ -5,7 +5,6 @@ import pytest
 from test_ranges import cart, searched
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.score_test import promises_of_sets
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.sets.pairs import together
 from simpel_cli.discovery.search.trials import Search, asked
@@ -77,9 +76,7 @@ def test_a_set_promises_what_its_effects_promise_together(planted: Search) -> No
     where = {planted.terms[t].effect: i for i, (t, _) in reversed(list(enumerate(starts)))}
     linear, cubic, shift = (where[name] for name in ("linear", "cubic", "shift"))
     sets = [(linear,), (cubic,), (linear, cubic), (linear, shift), (shift,)]
-    width, known = planted.fitter.width, planted.free(())
-    args = planted.plan, planted.fitter, width, known, base.optimum.z, starts
-    gains = [score.gain for score in promises_of_sets(*args, sets)]
+    gains = [score.gain for score in planted.promises(base, starts, sets)]
     alone = [score.gain for score in planted.promises(base, starts)]
     np.testing.assert_allclose([gains[0], gains[1], gains[4]], [alone[linear], alone[cubic], alone[shift]], rtol=1e-6)
     assert gains[2] > 20 > 5 * max(gains[0], gains[1])

@@ -39,21 +39,9 @@ def promises(
     known: tuple[int, ...],
     z: np.ndarray,
     starts: Sequence[tuple[int, Hypothesis]],
+    sets: Sequence[tuple[int, ...]] | None = None,
 ) -> list[Score]:
-    """Return what each start of each term promises by itself: see `promises_of_sets`."""
-    return promises_of_sets(plan, fit, width, known, z, starts, [(i,) for i in range(len(starts))])
-
-
-def promises_of_sets(
-    plan: Setup,
-    fit: Callable[[list[Hypothesis], int], list[Optimum]],
-    width: int,
-    known: tuple[int, ...],
-    z: np.ndarray,
-    starts: Sequence[tuple[int, Hypothesis]],
-    sets: Sequence[tuple[int, ...]],
-) -> list[Score]:
-    """Return what each set of starts promises together.
+    """Return what each start of each term promises, or what each set of starts promises together.
 
     Args:
         plan: of the search.
@@ -62,8 +50,9 @@ def promises_of_sets(
         known: unknowns that move in the model without the terms.
         z: optimum of that model, unit coordinates.
         starts: term and start; parameters whose neutral value is 0 are amplitudes and are switched off, others keep it.
-        sets: places in `starts`, of different terms each.
+        sets: places in `starts`, of different terms each; None: every start by itself.
     """
+    sets = [(i,) for i in range(len(starts))] if sets is None else sets
     terms = plan.augmented.terms
     rows = {term: tuple(plan.augmented.rows(terms[term])) for term, _ in starts}
     room = width - len(known)

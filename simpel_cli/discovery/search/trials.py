@@ -127,9 +127,12 @@ class Search:
         """Whether the compiled program has room for them."""
         return len(self.free(terms)) <= self.fitter.width
 
-    def promises(self, before: Trial, starts: Sequence[tuple[int, Hypothesis]]) -> list[Score]:
-        """Return what each start of each term promises beside a fitted set."""
-        return promises(self.plan, self.fitter, self.fitter.width, self.free(before.terms), before.optimum.z, starts)
+    def promises(
+        self, before: Trial, starts: Sequence[tuple[int, Hypothesis]], sets: Sequence[tuple[int, ...]] | None = None
+    ) -> list[Score]:
+        """Return what each start of each term, or each set of starts together, promises beside a fitted set of terms."""
+        free, z = self.free(before.terms), before.optimum.z
+        return promises(self.plan, self.fitter, self.fitter.width, free, z, starts, sets)
 
     def hypotheses(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Hypothesis]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""

@@ -44,18 +44,21 @@ class Windows(NamedTuple):
     clock: np.ndarray
 
     @property
+    def lead(self) -> int:
+        """Rows of the past in front of the inputs."""
+        return self.u.shape[1] - self.clock.shape[1]
+
+    @property
     def arrays(self) -> tuple[Array, ...]:
         """What the filter takes, window by window: the clock stands behind the inputs."""
-        lead = self.u.shape[1] - self.clock.shape[1]
-        clock = np.pad(self.clock, ((0, 0), (lead, 0), (0, 0)))
+        clock = np.pad(self.clock, ((0, 0), (self.lead, 0), (0, 0)))
         u = np.concatenate([self.u, clock], axis=2)
         return tuple(jnp.asarray(a) for a in (self.y, self.ok, u, self.start, self.spread))
 
     def first(self, rows: int) -> "Windows":
         """Return the first rows of every window."""
-        lead = self.u.shape[1] - self.clock.shape[1]
         return self._replace(
-            y=self.y[:, :rows], ok=self.ok[:, :rows], u=self.u[:, : lead + rows], clock=self.clock[:, :rows]
+            y=self.y[:, :rows], ok=self.ok[:, :rows], u=self.u[:, : self.lead + rows], clock=self.clock[:, :rows]
         )
 
 

@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 
-from simpel_cli.discovery.search.score_test import promises_of_sets
 from simpel_cli.discovery.search.trials import PROMISING, Search, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 
@@ -32,8 +31,7 @@ def together(search: Search, before: Trial) -> Trial | None:
     most = sorted(alone, key=lambda t: -alone[t][0])[:MOST]
     pairs = [pair for pair in combinations(most, 2) if search.fits((*before.terms, *pair))]
     sets = [(alone[a][1], alone[b][1]) for a, b in pairs]
-    known = search.free(before.terms)
-    scores = promises_of_sets(search.plan, search.fitter, search.fitter.width, known, before.optimum.z, starts, sets)
+    scores = search.promises(before, starts, sets)
     gains = [score.gain if np.isfinite(score.gain) else 0.0 for score in scores]
     # beside what one of them promises: a pair is more than its better half
     beside = [gain - max(alone[t][0] for t in pair) for gain, pair in zip(gains, pairs, strict=True)]
