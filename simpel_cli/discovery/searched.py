@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from simpel_cli.data import Recording, read
+from simpel_cli.discovery.ground import Ground, counted, ground_of
 from simpel_cli.discovery.search.acceptance import accepted, proposed, with_interactions
+from simpel_cli.discovery.search.again import Earlier
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
-from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, with_own
@@ -28,14 +29,12 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, ti
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for, suited
-from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
-from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned, outlier_check, without_computed
+from simpel_cli.filtering.measurements.cleaning import outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows, thinned
 from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, whole_windows
-from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.declared import Declared
 from simpel_cli.studies.open import Study
@@ -91,7 +90,7 @@ def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[st
     def evidence(at: Mapping[str, float]) -> float:
         own = replace(measurements, latency=dict(measurements.latency) | dict(at))
         recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
-        recording = _counted(same_readings(recording, columns, at, longest, model.dt), study)
+        recording = counted(same_readings(recording, columns, at, longest, model.dt), study)
         plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
         optimum = carried(known[-1][0], known[-1][1].optimum.z, plan) if known else None
         base = small_search(plan._replace(optimum=optimum), options.lanes, 1).base()
@@ -111,67 +110,21 @@ def with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
     return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
 
 
-def _counted(recording: Recording, study: Study, *, spikes: bool = False) -> Recording:
-    """Return measurements whose values count by the scale of their noise, where `data.noise.scale` says it."""
-    source, formulas = study.system.source, dict(study.measurements.noise_scale)
-    computed = set(recording.derived) - set(study.recording.estimated)
-    formulas = {name: formula for name, formula in formulas.items() if name not in computed}  # no channels
-    measured = [*recording.outputs, *(q.name for q in source.states)]
-    unmeasured = [q.name for q in source.outputs if q.name not in measured]
-    scale = noise_scale_of(formulas, encoding_of(source, recording.outputs), [*study.recording.estimated, *unmeasured])
-    return recording if scale is None else scale.counted(recording, spikes=spikes)
-
-
-def _alike(recording: Recording) -> Recording:
-    """Return measurements that all count alike."""
-    train, test = (tuple(e._replace(weight=None) for e in part) for part in (recording.train, recording.test))
-    return recording._replace(train=train, test=test)
-
-
-class _Ground(NamedTuple):
-    """What every search of a run shares.
-
-    Args:
-        model: the simulator as it was declared.
-        clean: measurements without what stands out.
-        options: of the search.
-        declared_noise: channels whose noise the user declared.
-        terminal: takes lines.
-        budget: time that it may take.
-        wider: how often ranges of the model or of effects were found too narrow.
-    """
-
-    model: Model
-    clean: Cleaned
-    options: Discovery
-    declared_noise: tuple[str, ...]
-    terminal: Terminal
-    budget: Budget
-    wider: int = 0
-
-    def attach(self, effects: list[Expression]) -> partial[Setup]:
-        """Return the function of a simulator that sets a search with these effects up."""
-        return partial(
-            setup, recording=self.clean.recording, declared_noise=self.declared_noise, effects=effects,
-            substeps=self.options.substeps, pairs=self.options.pairs, most_rows=self.options.rows,
-        )  # fmt: skip
-
-
 def search_of(study: Study, terminal: Terminal) -> Searched:
     """Clean the measurements and search; once more with wider ranges where they pay; calibrate for the use that is named."""
     effects: list[Expression] = study.declared.groups["effect"]
-    ground = _ground(study, len(effects), terminal)
+    ground = ground_of(study, len(effects), terminal)
     declared = ground.model
     found = _search_in_groups(ground, effects)
     while isinstance(found, Wider):
         terminal.line(ranges_in_words(found), "ranges")
         model, effects = widened(ground.model, effects, found.ranges)
-        ground = ground._replace(model=model, wider=ground.wider + 1)
+        ground = ground._replace(model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier)
         found = _search_in_groups(ground, effects)
     return _for_use(ground, found, declared, terminal)
 
 
-def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Terminal) -> Searched:
+def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Terminal) -> Searched:
     """Calibrate the models before and after for what they will be used for (`discovery.for`).
 
     Before is the simulator as it was declared: one value for all groups, in the ranges that it gives.
@@ -212,7 +165,7 @@ def _for_use(ground: _Ground, found: Searched, declared: Model, terminal: Termin
     return found
 
 
-def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched | Wider:
+def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider:
     """Search; once more with the effects that differ from group to group, as long as that pays."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
@@ -223,37 +176,19 @@ def _search_in_groups(ground: _Ground, effects: list[Expression]) -> Searched | 
             break
         effects = grouped
         ground.terminal.line("searching once more with it", "groups")
-        again = _search(ground, effects, [g for g in found.groupings if g.parameter])
+        known = Earlier(found.search, found.selection.chosen)
+        again = _search(ground._replace(earlier=known), effects, [g for g in found.groupings if g.parameter])
         if isinstance(again, Wider):
             return again
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
             return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen))
         before = confirmed(found.groupings, again.search, again.selection.chosen)
-        known = {(g.subject, g.per): g for g in (*before, *again.groupings)}
-        found = again._replace(groupings=list(known.values()))
+        each = {(g.subject, g.per): g for g in (*before, *again.groupings)}
+        found = again._replace(groupings=list(each.values()))
     return found
 
 
-def _ground(study: Study, effects: int, terminal: Terminal) -> _Ground:
-    """Clean the measurements; says what is searched in."""
-    model = study.system.source
-    assert isinstance(model, Model)
-    options: Discovery = study.declared.groups.get("discovery") or Discovery()
-    terminal.line(f"simpel discover · {model.name} · {effects} effects · {study.device}", style="bold")
-    declared_noise = tuple(study.measurements.noise_std)
-    clean = cleaned(_counted(study.recording, study, spikes=True), model, declared_noise)
-    # once more: what is typical is not what a lone value would make of it
-    clean = clean._replace(recording=_counted(_alike(clean.recording), study))
-    bad = [c for c in clean.recording.checks if not c.ok]
-    checks = len(clean.recording.checks)
-    terminal.line("; ".join(f"{c.name}: {c.detail}" for c in bad) if bad else f"{checks} ok", "data")
-    rows = sum(len(e.time) for e in clean.recording.train)
-    if rows > options.rows:
-        terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    return _Ground(model, clean, options, declared_noise, terminal, Budget(seconds_of(options.budget)))
-
-
-def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched | Wider:
+def _search(ground: Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched | Wider:
     """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
 
     Args:
@@ -271,7 +206,8 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
         found = _with(ground, effects, own, ask=settled is None)
         if isinstance(found, Searched | Wider):
             return found
-        settled = own = found
+        own, earlier = found
+        settled, ground = own, ground._replace(earlier=earlier)
         for one in own:
             terminal.line(f"beside these effects {grouping_in_words(one)}", "groups")
         terminal.line("searching once more", "groups")
@@ -279,21 +215,21 @@ def _search(ground: _Ground, effects: list[Expression], settled: list[Grouping] 
 
 def _chosen_in(
     found: Calibrated, assessor: Assessor, options: Discovery, terminal: Terminal,
-    wider: Callable[[Search, Trial], Wider | None],
+    wider: Callable[[Search, Trial], Wider | None], earlier: Earlier | None = None,
 ) -> tuple[Selection, list[Gate]] | Wider:  # fmt: skip
     """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow."""
-    proposal = proposed(found.search, assessor, found.base, options)
+    proposal = proposed(found.search, assessor, found.base, options, earlier=earlier)
     if (ends := wider(found.search, proposal.chosen)) is not None:
-        return ends
+        return ends._replace(earlier=Earlier(found.search, proposal.chosen))
     judged, gates = accepted(found.search, assessor, proposal, terminal)
     left = judged.chosen.terms != proposal.chosen.terms  # what was refused may have made up for a range
     ends = wider(found.search, judged.chosen) if left else None
-    return (judged, gates) if ends is None else ends
+    return (judged, gates) if ends is None else ends._replace(earlier=Earlier(found.search, judged.chosen))
 
 
 def _with(
-    ground: _Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
-) -> Searched | Wider | list[Grouping]:
+    ground: Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
+) -> Searched | Wider | tuple[list[Grouping], Earlier]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:
@@ -326,7 +262,7 @@ def _with(
     assessor, found = begun_in(plan)
     if (ends := wider(found.search, found.base)) is not None:
         return ends
-    outcome = _chosen_in(found, assessor, options, terminal, wider)
+    outcome = _chosen_in(found, assessor, options, terminal, wider, ground.earlier)
     if isinstance(outcome, Wider):
         return outcome
     selection, gates = outcome
@@ -335,24 +271,24 @@ def _with(
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
     if words_of(between_rows) != said:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
-        plan = attach(saying(model, between_rows), kept=kept)
+        plan, earlier = attach(saying(model, between_rows), kept=kept), Earlier(found.search, chosen)
         assessor, found = begun_in(plan)
-        outcome = _chosen_in(found, assessor, options, terminal, wider)
+        outcome = _chosen_in(found, assessor, options, terminal, wider, earlier)
         if isinstance(outcome, Wider):
             return outcome
         selection, gates = outcome
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
-            return beside
+            return beside, Earlier(found.search, selection.chosen)
         own = beside  # what it is worth beside the effects
     # beside what is left unexplained, no data tell whether tails are heavy
     skip = bool(selection.remainder) or ground.budget.over("heavy tails of the noise")
     heavy = None if skip else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
     if heavy is not None:
-        found = heavy
+        found, earlier = heavy, Earlier(found.search, selection.chosen)
         found.search.budget = ground.budget
-        selection = proposed(found.search, assessor, found.base, options)
+        selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
         selection, gates = accepted(found.search, assessor, selection, terminal)
     search, windows = found.search, found.test
     by_simulations = None

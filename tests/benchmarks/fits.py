@@ -34,7 +34,7 @@ def timed(name: str, rounds: int, job: Job) -> None:
         declared = declare(config | {"run": {**(config.get("run") or {}), "precision": "float64"}})
         study, terminal = open_study(declared, job.data_folder, whole=False), Terminal(quiet=True)
         effects: list[Any] = declared.groups["effect"]
-        ground = searched._ground(study, len(effects), terminal)
+        ground = searched.ground_of(study, len(effects), terminal)
         attach, options = ground.attach(effects), ground.options
         terms = terms_of(ground.model, ground.clean.recording, effects, pairs=options.pairs)
         plan = prepared(attach, ground.model, terms, options, terminal)[0]

@@ -15,6 +15,7 @@ from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import searched as searched_module
 from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, proposed
+from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
@@ -130,6 +131,9 @@ class Table:
                 Optimum(hypothesis.z, hypothesis.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True)
             )
         return found
+
+    def terms(self, names: str) -> tuple[int, ...]:
+        return tuple(next(t for t, term in enumerate(self.search.terms) if term.effect == name) for name in names)
 
     def chosen(self, **options: int) -> str:
         found = select(self.search, **options)
@@ -457,14 +461,64 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
         judgements.append(selection)
         return judged, []
 
-    monkeypatch.setattr(searched_module, "proposed", lambda *_: proposal)
+    monkeypatch.setattr(searched_module, "proposed", lambda *_, **__: proposal)
     monkeypatch.setattr(searched_module, "accepted", accept)
     none: Any = None
     found: Any = SimpleNamespace(search=none, base=none)
     outcome = unwrap(_chosen_in)(found, none, none, none, ends)
-    assert outcome is wider if asks else outcome == (judged, [])
+    chosen = proposal.chosen if asks == "proposed" else judged.chosen
+    assert outcome == (wider._replace(earlier=Earlier(none, chosen)) if asks else (judged, []))
     assert asked_of == questions
     assert judgements == ([] if asks == "proposed" else [proposal])
+
+
+def test_a_name_that_does_better_beside_what_came_later_takes_the_place_of_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(forward, "together", lambda *_: None)
+    gains = {"": 0.0, "A": 30.0, "AB": 50.0, "B": 5.0, "C": 6.0}
+    assert Table(gains | {"BC": 50.1 + TIE}).chosen(beginnings=0) == "BC"
+    assert Table(gains | {"BC": 49.9 + TIE}).chosen(beginnings=0) == "AB"
+    assert Table(gains | {"BC": 60.0, "C": 58.0}).chosen(beginnings=0) == "C"  # beside which B earns nothing
+
+
+def test_a_path_that_stays_behind_the_best_one_goes_no_further() -> None:
+    gains = {
+        "": 0.0,
+        "A": 30.0,
+        "AD": 60.0,
+        "ADE": 90.0,
+        "ABDE": 120.0,
+        "C": 29.0,
+        "BC": 58.0,
+        "BCD": 85.0,
+        "ABCD": 99.0,
+    }
+    table = Table(gains)
+    ways = list[str]()
+    table.search.report = ways.append
+    leader = tuple(
+        table.search.part(table.search.base(), table.terms(names)) for names in ("", "A", "AD", "ADE", "ADEB")
+    )
+    start = leader[0], table.search.part(leader[0], table.terms("C"))
+    assert len(forward._grow(table.search, start, leader=leader).path[-1].terms) == 3
+    assert len(forward._grow(table.search, start).path[-1].terms) == 5
+    start = leader[0], table.search.part(leader[0], table.terms("D"))
+    assert set(forward._grow(table.search, start, leader=leader).path[-1].terms) == set(table.terms("AD"))
+
+
+def test_a_search_that_is_made_again_begins_with_what_the_last_one_chose() -> None:
+    gains = {"": 0.0, "A": 30.0, "AB": 50.0, "CD": 55.0 + asked(1)}
+    earlier, table = Table(gains), Table(gains)
+    chosen = earlier.search.part(earlier.search.base(), earlier.terms("CD"))
+    path = path_in(table.search, table.search.base(), Earlier(earlier.search, chosen))
+    assert [t.terms for t in path] == [(), table.terms("C"), table.terms("CD")]
+    none: Any = None
+    found = unwrap(proposed)(table.search, none, path[0], none, earlier=Earlier(earlier.search, chosen))
+    assert set(found.chosen.terms) == set(table.terms("CD"))
+    assert found.stages[0].before.terms == ()
+    table.search.banned |= set(table.terms("CD"))
+    assert path_in(table.search, path[0], Earlier(earlier.search, chosen)) == ()
 
 
 @pytest.mark.parametrize(("formula", "stays"), [(96.0, True), (85.0, False)])

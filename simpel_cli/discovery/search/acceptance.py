@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
+from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.near import far
 from simpel_cli.discovery.search.sets.forward import further, selected, widely
@@ -23,8 +24,9 @@ MOST_SEARCHES = 3  # each goes on without the effects that did harm in those bef
 
 
 def proposed(
-    search: Search, assessor: Assessor, base: Trial, options: Discovery, begun: tuple[Trial, ...] = ()
-) -> Selection:
+    search: Search, assessor: Assessor, base: Trial, options: Discovery, begun: tuple[Trial, ...] = (), *,
+    earlier: Earlier | None = None,
+) -> Selection:  # fmt: skip
     """Search by evidence; where errors ahead stay far above the noise, effects begin anywhere in their ranges, too.
 
     Args:
@@ -33,7 +35,10 @@ def proposed(
         base: the calibrated simulator.
         options: of the search.
         begun: as of `selected`.
+        earlier: a search that this one is made after, which has tried other beginnings.
     """
+    if earlier is not None and (path := path_in(search, base, earlier)):
+        return selected(search, base, 0, path)
     selection = selected(search, base, options.beginnings, begun)
     return widely(search, selection) if far(search, assessor, selection.chosen) else selection
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from simpel_cli.discovery.search.again import Earlier
 from simpel_cli.discovery.search.trials import ACCEPT, TIE, Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
@@ -34,10 +35,12 @@ class Wider(NamedTuple):
     Args:
         ranges: by the names of their parameters.
         gain: nats of evidence.
+        earlier: what was chosen without them.
     """
 
     ranges: dict[str, Range]
     gain: float
+    earlier: Earlier | None = None
 
 
 def too_narrow(search: Search, trial: Trial) -> Wider | None:

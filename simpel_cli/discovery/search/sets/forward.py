@@ -22,6 +22,7 @@ MOST_MERGERS = 2
 MOST_RUNNERS_UP = 8  # effects that a search could begin with
 BEGINNINGS = 2  # that it does begin with, beside the one that explains most
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
+MOST_BEHIND = 2  # effects in a row with which a path may be worth less than the best one so far with as many
 
 
 class _Grown(NamedTuple):
@@ -54,10 +55,12 @@ def selected(
         begun: fits from the calibrated simulator to a set of effects that the search begins with, too.
     """
     base = base or search.base()
-    grown = _grow(search, (base,))
+    grown = _grow(search, (base,), leader=begun)
     if len(begun) > 1:
         search.report(f"beginning with {' and '.join(search.terms[t].label for t in begun[-1].terms)}")
-        grown = max(grown, _grow(search, begun), key=lambda g: worth(g.path[-1]))
+        again = _grow(search, begun)
+        again = again._replace(stages=(*grown.stages[:1], *again.stages))
+        grown = max(grown, again, key=lambda g: worth(g.path[-1]))
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
@@ -135,16 +138,17 @@ def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, 
         grown = again._replace(stages=(*led, *again.stages))
 
 
-def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False) -> _Grown:
+def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, leader: tuple[Trial, ...] = ()) -> _Grown:
     """Add one effect after another to the end of a path, as long as they earn their place.
 
     Args:
         search: over sets of effects.
         path: to begin with.
         widely: the first one, and one at the end, may begin anywhere in its ranges.
+        leader: the best path so far: one that falls behind it, or comes to the same effects, goes no further.
     """
     stages: list[Stage] = []
-    wide = widely
+    wide, behind = widely, 0
     remainder = None
     while True:
         current = path[-1]
@@ -180,6 +184,11 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False) -> _
             return _Grown(path, tuple(stages), remainder)
         path, wide = (*path, best), False
         search.report(f"{search.terms[best.terms[-1]].label} +{gain:.0f}")
+        if 1 < len(best.terms) < len(leader):
+            there = leader[len(best.terms)]
+            behind = behind + 1 if worth(best) < worth(there) else 0
+            if behind == MOST_BEHIND or set(best.terms) == set(there.terms):
+                return _Grown(path, tuple(stages), None)
 
 
 def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
@@ -200,7 +209,7 @@ def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
         seen.append(here)
         tried += 1
         search.report(f"beginning with {search.terms[trial.terms[-1]].label}")
-        other = _grow(search, (grown.path[0], trial))
+        other = _grow(search, (grown.path[0], trial), leader=grown.path)
         yield other._replace(stages=(first, *other.stages))
 
 

@@ -6,10 +6,15 @@ import numpy as np
 
 from simpel_cli.discovery.search.sets.selection import nameless, worth
 from simpel_cli.discovery.search.trials import ACCEPT, SHARE, Search, Stage, Trial, asked
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
 MOST_AGAIN = 3
 NEARLY_ALL = 0.7  # of what two effects explain: a fit that came to less in their place need not be made again
+MOST_OF_IT = (
+    0.4  # likewise, of what a term in their place explains to first order, with a shape that is still to be found
+)
+SIGNALS = (*OPERATORS, SENSOR, INPUT)
 
 
 def merged(search: Search, chosen: Trial) -> Stage | None:
@@ -27,16 +32,18 @@ def merged(search: Search, chosen: Trial) -> Stage | None:
 
 def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stage | None:
     most, found = worth(chosen), None
+    alike = [_alike(search, chosen, pair) for pair in pairs]
+    pairs, alike = [p for p, own in zip(pairs, alike, strict=True) if own], [own for own in alike if own]
     sets = [tuple(t for t in chosen.terms if t not in pair) for pair in pairs]
     fits = search.fitter([hypothesis for less in sets for hypothesis in search.less(chosen, less)])
-    for k, (pair, less) in enumerate(zip(pairs, sets, strict=True)):
+    for k, less in enumerate(sets):
         rest = search.best(less, fits[2 * k : 2 * k + 2])
-        promising = _in_place_of(search, chosen, pair, rest)
+        promising = _in_place_of(search, chosen, alike[k], rest)
         if not promising:
             continue
         stage = search.add(rest, promising)
         # with two terms less the noise may have settled elsewhere: the best begin once more with that of the chosen model
-        z = search.off(chosen.optimum.z, pair)
+        z = search.off(chosen.optimum.z, pairs[k])
         again = [t for t in stage.trials if not nameless(search, t)][:MOST_AGAIN]
         hypotheses = [(t.terms, hypothesis) for t in again for hypothesis in search.hypotheses(t.terms, t.terms[-1], z)]
         for (terms, _), optimum in zip(
@@ -53,11 +60,45 @@ def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stag
     return found
 
 
-def _in_place_of(search: Search, chosen: Trial, pair: tuple[int, ...], rest: Trial) -> list[int]:
+def _alike(search: Search, chosen: Trial, pair: tuple[int, int]) -> list[int]:
+    """Return the terms that point where a pair of effects points, before anything is fitted.
+
+    Where both are switched off and nothing else has moved, what is left is what they explain. A term in their place has to
+    explain most of that, to first order, with the noise of the chosen model. A slope tells nothing of a late signal: that may
+    stand for two effects of signals, of which it shares a channel or through which it acts.
+    """
+    rest = Trial(tuple(t for t in chosen.terms if t not in pair), chosen.optimum)
+    off = rest._replace(optimum=chosen.optimum._replace(z=search.off(chosen.optimum.z, pair)))
+    candidates = [t for t in search.candidates(rest.terms) if t not in pair]
+    own = [(t, Hypothesis(chosen.optimum.z, search.free(chosen.terms), search.ones)) for t in pair]
+    starts = [*own, *search.starts(off, candidates)]
+    sets = [(0, 1), *((i,) for i in range(2, len(starts)))]
+    both, *each = search.promises(off, starts, sets)
+    if np.isfinite(both.gain):
+        least = MOST_OF_IT * both.gain
+    else:
+        parts = (search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in pair)
+        least = SHARE * max(chosen.optimum.log_evidence - part.optimum.log_evidence for part in parts)
+    return list(dict.fromkeys(
+        t for (t, _), score in zip(starts[2:], each, strict=True)
+        if (score.gain > least if np.isfinite(score.gain) else _through(search, t, pair))
+    ))  # fmt: skip
+
+
+def _through(search: Search, term: int, pair: tuple[int, int]) -> bool:
+    """Whether a late signal may stand for a pair: both are of signals, and it is an input's or on a channel of theirs."""
+    new, *others = (search.terms[t] for t in (term, *pair))
+    if not all(other.kind in SIGNALS for other in others):
+        return False
+    ends = {other.acts_on for other in others}
+    inputs = {q.name for q in search.plan.augmented.model.inputs}
+    return new.acts_on in ends | inputs or ends <= inputs
+
+
+def _in_place_of(search: Search, chosen: Trial, candidates: list[int], rest: Trial) -> list[int]:
     """Return the terms that may do as well as a pair of effects: they promise a share of what is needed beside the rest.
 
-    Of a late signal a slope cannot tell. It can only stand for effects of which one is of a signal, too. What was fitted beside
-    the rest already, and came to much less, is left.
+    What was fitted beside the rest already, and came to much less, is left.
     """
     whole = chosen.optimum.log_evidence - asked(len(chosen.terms)) - rest.optimum.log_evidence
 
@@ -65,10 +106,8 @@ def _in_place_of(search: Search, chosen: Trial, pair: tuple[int, ...], rest: Tri
         known = search.known.get(frozenset((*rest.terms, term)))
         return known is not None and known.log_evidence - rest.optimum.log_evidence < NEARLY_ALL * whole
 
-    candidates = [t for t in search.candidates(rest.terms) if t not in pair and not fell_short(t)]
-    signals = any(search.terms[t].kind in (*OPERATORS, SENSOR, INPUT) for t in pair)
-    starts = search.starts(rest, candidates)
+    starts = search.starts(rest, [t for t in candidates if not fell_short(t)])
+    scores = search.promises(rest, starts)
     return list(dict.fromkeys(
-        t for (t, _), score in zip(starts, search.promises(rest, starts), strict=True)
-        if score.gain > SHARE * whole and (np.isfinite(score.gain) or signals or search.terms[t].kind not in OPERATORS)
+        t for (t, _), score in zip(starts, scores, strict=True) if score.gain > SHARE * whole
     ))  # fmt: skip

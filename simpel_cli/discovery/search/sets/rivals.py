@@ -1,16 +1,20 @@
-"""Which names do as well as the chosen ones, and which of these a function without a name makes superfluous."""
+"""Which names do as well as the chosen ones, which do better, and which a function without a name makes superfluous."""
 
 from collections.abc import Sequence
 
 from simpel_cli.discovery.search.sets.selection import Selection, asked_for, nameless, weeded
-from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, TIE, Search, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 
 MOST = 0.9  # of what a function without a name explains: a formula that explains so much of it stays
 
 
 def rivalled(search: Search, found: Selection) -> Selection:
-    """Take out, one at a time, the effects that a function without a name makes superfluous; name the rivals of the rest."""
+    """Take out, one at a time, the effects that a function without a name makes superfluous; name the rivals of the rest.
+
+    A name that does better in the place of another takes it: what explained most when an effect was added need not be what
+    explains most beside those that came later.
+    """
     every = found.chosen.terms
     without: Sequence[Trial] = [search.part(found.chosen, tuple(t for t in every if t != gone)) for gone in every]
     instead = found.instead
@@ -18,9 +22,13 @@ def rivalled(search: Search, found: Selection) -> Selection:
     while True:
         chosen, classes = found.chosen, list[tuple[Trial, ...]]()
         superfluous: dict[int, int] = {}
+        swapped: Trial | None = None
         for i, rest in enumerate(without):
             rivals = search.rivals(chosen, rest)
             classes.append(tuple(t for t in rivals if not nameless(search, t)))
+            best = max(classes[-1], key=lambda t: t.optimum.log_evidence, default=chosen)
+            if best.optimum.log_evidence > (swapped or chosen).optimum.log_evidence + (0 if swapped else TIE):
+                swapped = best
             beaten = next((t for t in rivals if nameless(search, t)), None)
             if instead is not None and chosen.terms[i] not in instead.terms:
                 beaten = instead
@@ -29,6 +37,13 @@ def rivalled(search: Search, found: Selection) -> Selection:
                 left[whole.terms[-1]] = whole.optimum.log_evidence - chosen.optimum.log_evidence
             elif beaten is not None:
                 superfluous[i] = beaten.terms[-1]
+        if swapped is not None:
+            new, (old,) = search.terms[swapped.terms[-1]], set(chosen.terms) - set(swapped.terms)
+            more = swapped.optimum.log_evidence - chosen.optimum.log_evidence
+            search.report(f"{new.label} in place of {search.terms[old].label} +{more:.0f}")
+            found, without = weeded(search, found._replace(chosen=swapped), range(len(chosen.terms)))
+            left, instead = asked_for(search, found.chosen, left), None
+            continue
         if not superfluous:
             break
         gone = min(superfluous, key=lambda i: found.gains[i])
