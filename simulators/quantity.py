@@ -15,7 +15,8 @@ TIMES = ("delay", "lag")  # of an input
 BETWEEN_ROWS = ("held", "linear")  # what an input does from one row to the next
 GIVEN = (*TIMES, "between_rows")  # of an input
 LIMITS = ("limits", "role")  # of a state
-ROLES = ("position", "velocity", "level", "temperature", "other")  # of a state, that a user may declare
+HIDDEN = "hidden"  # role of a state that nothing measures, on which nothing acts but what its equation says
+ROLES = ("position", "velocity", "level", "temperature", "other", HIDDEN)  # of a state, that a user may declare
 READING = "reading"  # role of a state that is the lagging reading of a sensor; simpel gives it
 
 

@@ -1,7 +1,8 @@
 """What every search of a run shares: the simulator, clean measurements, options and time."""
 
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from simpel_cli.data import Recording
 from simpel_cli.discovery.search.again import Earlier
@@ -9,11 +10,11 @@ from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned
-from simpel_cli.filtering.setup import Setup, setup
+from simpel_cli.filtering.setup import Setup, key_of, setup
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
-from simulators.effects import Expression
+from simulators.effects import Expression, Term
 from simulators.model import Model
 
 
@@ -29,6 +30,7 @@ class Ground(NamedTuple):
         budget: time that it may take.
         wider: how often ranges of the model or of effects were found too narrow.
         earlier: what was chosen before something else was known.
+        remembering: effects with a state of their own that the program has room for.
     """
 
     model: Model
@@ -39,13 +41,20 @@ class Ground(NamedTuple):
     budget: Budget
     wider: int = 0
     earlier: Earlier | None = None
+    remembering: tuple[Term, ...] = ()
 
-    def attach(self, effects: list[Expression]) -> partial[Setup]:
+    def attach(self, effects: list[Expression]) -> Callable[..., Setup]:
         """Return the function of a simulator that sets a search with these effects up."""
-        return partial(
+        attached = partial(
             setup, recording=self.clean.recording, declared_noise=self.declared_noise, effects=effects,
             substeps=self.options.substeps, pairs=self.options.pairs, most_rows=self.options.rows,
         )  # fmt: skip
+
+        def with_memory(model: Model, *, extra: Sequence[Term] = (), **more: Any) -> Setup:
+            given = {key_of(t) for t in extra}
+            return attached(model, extra=(*(t for t in self.remembering if key_of(t) not in given), *extra), **more)
+
+        return with_memory
 
 
 def counted(recording: Recording, study: Study, *, spikes: bool = False) -> Recording:

@@ -40,9 +40,14 @@ from simpel_cli.studies.close_loop import close, past_inputs
 from simpel_cli.studies.declared import Declared, resolved
 from simpel_cli.studies.new_run import new_run
 from simpel_cli.studies.open import open_study, refuse_untested
+from simulators.effects import stores_of
 from simulators.model import Model
 
 IN_PYTHON = "a simulator in Python, whose YAML does not name it: make it differ there"
+NOT_ALIKE = (
+    "the corrected simulator has a state that nobody measures, so that scores of a fit with it are of other outputs than those "
+    "without it; fit it by itself"
+)
 Publish = Callable[[Terminal, dict[str, Any], Path, dict[str, Any]], Any]  # terminal, verdict, directory, configuration
 
 
@@ -187,7 +192,10 @@ def _correct(
     name, node, left_out = corrected(written(config["sim"], said), model, searched.search, searched.selection.chosen)
     path = directory / "conf" / "sim" / f"{name}.yaml"
     data = directory / "conf" / "data" / f"{declared.choices.get('data')}.yaml"  # the user's own lies elsewhere
-    for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"]))):
+    hidden = [s.name for s in stores_of(searched.search.terms[t] for t in searched.selection.chosen.terms)]
+    hidden = [name for name in hidden if name in node.get("states", {})]
+    columns = {"columns": (config["data"].get("columns") or {}) | dict.fromkeys(hidden)} if hidden else {}
+    for file, content in ((path, f"# {found['summary']}\n" + dump(node)), (data, dump(config["data"] | columns))):
         file.parent.mkdir(parents=True)
         write_text(file, content)
     # groups that only the search was about are no inputs of what is fitted
@@ -198,7 +206,9 @@ def _correct(
         "corrected_sim_lacks": [*left_out, *nowhere],
         "stack_actions": past_inputs(after.source),
     }
-    if config.get("close", True) and (len(nowhere) < changes or len(left_out) < len(found["effects"])):
+    if hidden:
+        added["not_closed"] = f"{NOT_ALIKE}: simpel fit --config-dir {directory.name}/conf sim={name} data={data.stem}"
+    elif config.get("close", True) and (len(nowhere) < changes or len(left_out) < len(found["effects"])):
         try:
             added["as_prior"] = close(declared, after, directory, data_folder, terminal)
         except DataError as error:  # a fit needs whole rows; what was found stands without it

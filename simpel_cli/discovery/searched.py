@@ -27,6 +27,7 @@ from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
+from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for, suited
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -34,7 +35,7 @@ from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows, thinned
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, whole_windows
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, whole_windows, with_memory
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.declared import Declared
 from simpel_cli.studies.open import Study
@@ -110,16 +111,27 @@ def with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
     return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
 
 
+class Again(NamedTuple):
+    """Effects with a state of their own, with which a search is worth making again, beside what it chose or alone."""
+
+    memory: Memory
+    earlier: Earlier | None
+
+
 def search_of(study: Study, terminal: Terminal) -> Searched:
-    """Clean the measurements and search; once more with wider ranges where they pay; calibrate for the use that is named."""
+    """Clean the measurements and search; once more with wider ranges or a hidden state; calibrate for the use that is named."""
     effects: list[Expression] = study.declared.groups["effect"]
     ground = ground_of(study, len(effects), terminal)
     declared = ground.model
     found = _search_in_groups(ground, effects)
-    while isinstance(found, Wider):
-        terminal.line(ranges_in_words(found), "ranges")
-        model, effects = widened(ground.model, effects, found.ranges)
-        ground = ground._replace(model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier)
+    while not isinstance(found, Searched):
+        if isinstance(found, Wider):
+            terminal.line(ranges_in_words(found), "ranges")
+            model, effects = widened(ground.model, effects, found.ranges)
+            ground = ground._replace(model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier)
+        else:
+            terminal.line(found.memory.words, "memory")
+            ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
         found = _search_in_groups(ground, effects)
     return _for_use(ground, found, declared, terminal)
 
@@ -165,11 +177,11 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
     return found
 
 
-def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider:
+def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Again:
     """Search; once more with the effects that differ from group to group, as long as that pays."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
-        if isinstance(found, Wider):
+        if not isinstance(found, Searched):
             return found
         grouped = grouped_effects(effects, found.groupings)
         if grouped == effects:
@@ -178,7 +190,7 @@ def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | W
         ground.terminal.line("searching once more with it", "groups")
         known = Earlier(found.search, found.selection.chosen)
         again = _search(ground._replace(earlier=known), effects, [g for g in found.groupings if g.parameter])
-        if isinstance(again, Wider):
+        if not isinstance(again, Searched):
             return again
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
             return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen))
@@ -188,7 +200,9 @@ def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | W
     return found
 
 
-def _search(ground: Ground, effects: list[Expression], settled: list[Grouping] | None = None) -> Searched | Wider:
+def _search(
+    ground: Ground, effects: list[Expression], settled: list[Grouping] | None = None
+) -> Searched | Wider | Again:
     """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
 
     Args:
@@ -204,7 +218,7 @@ def _search(ground: Ground, effects: list[Expression], settled: list[Grouping] |
             terminal.line(grouping_in_words(one), "groups")
     while True:
         found = _with(ground, effects, own, ask=settled is None)
-        if isinstance(found, Searched | Wider):
+        if isinstance(found, Searched | Wider | Again):
             return found
         own, earlier = found
         settled, ground = own, ground._replace(earlier=earlier)
@@ -229,7 +243,7 @@ def _chosen_in(
 
 def _with(
     ground: Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
-) -> Searched | Wider | tuple[list[Grouping], Earlier]:
+) -> Searched | Wider | Again | tuple[list[Grouping], Earlier]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:
@@ -253,6 +267,11 @@ def _with(
     def fitter(plan: Setup) -> Fitter:
         return fitter_of(plan, options.lanes, options.room + members(plan))
 
+    def remembering(levels: NoiseProfile, alone: NoiseProfile) -> tuple[Memory, bool] | None:
+        if ground.remembering or ground.budget.over("effects with a state of their own"):
+            return None
+        return worth_a_search(levels, alone, with_memory(model, ground.clean.recording, effects))
+
     def begun_in(plan: Setup) -> tuple[Assessor, Calibrated]:
         assessor = Assessor(plan, options.horizon, options.first_rows)
         found = calibrated(plan, fitter(plan), assessor, ground.clean, terminal)
@@ -261,7 +280,9 @@ def _with(
 
     assessor, found = begun_in(plan)
     if (ends := wider(found.search, found.base)) is not None:
-        return ends
+        # a state that is missing may be what a parameter at the end of its range makes up for
+        promising = remembering(at_base := NoiseProfile(found.search, assessor, found.base), at_base)
+        return Again(promising[0], None) if promising and promising[0].gain > ends.gain - TIE else ends
     outcome = _chosen_in(found, assessor, options, terminal, wider, ground.earlier)
     if isinstance(outcome, Wider):
         return outcome
@@ -307,7 +328,11 @@ def _with(
     attach_said = partial(attach, saying(model, between_rows))
     if not ground.budget.over("functions of two arguments"):
         selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
-    alone = drifting(NoiseProfile(search, assessor, selection.base)) if selection.chosen.terms else None
+    alone_levels = NoiseProfile(search, assessor, selection.base)
+    alone = drifting(alone_levels) if selection.chosen.terms else None
+    if (promising := remembering(levels, alone_levels)) is not None:
+        memory, chosen_too = promising
+        return Again(memory, Earlier(search, selection.chosen) if chosen_too else None)
     # what simulations have chosen need not be worth anything one row ahead
     if by_simulations is None and stands_for(alone, selection.base, selection.chosen):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")

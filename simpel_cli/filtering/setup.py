@@ -15,7 +15,7 @@ from simpel_cli.filtering.likelihood.track import Filter
 from simpel_cli.filtering.measurements import windows as windows_
 from simpel_cli.filtering.measurements.integration_steps import substeps_needed
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, clocked, padded, thinned, windows_of
-from simulators.effects import Expression, Scales, Term, unnamed
+from simulators.effects import Expression, Scales, Store, Term, stores_of, unnamed, with_stores
 from simulators.effects.term import (
     BACKLASH,
     BETWEEN_ROWS,
@@ -35,6 +35,7 @@ Q_BOUNDS = (1e-4, 3.0)  # of the process noise, in typical rates times sqrt(dt)
 Key: TypeAlias = tuple[str, str, tuple[str, ...]]
 MOST_PADDED = 4  # times the rows that windows of one length may have in all
 MOST_GROUPED = 2  # effects that differ between groups and act at once
+EMPTY = 0.1  # of its size: how far a state that an effect brings along may be from 0 where it begins there
 UNKNOWN_NOISE = 0.01  # of a channel's magnitude, where its noise begins if nothing tells it
 PLAY_ROWS = (
     24  # of the past before a window of a cut record: where an input is in its play, or on its way, is mostly settled
@@ -104,7 +105,9 @@ def setup(
     added = {key_of(t) for t in extra}
     terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)]
     terms += extra
-    given = model
+    given, stores = model, stores_of(terms)
+    if stores:
+        model, scales = with_stores(model, stores), _with_sizes(scales, stores)
     if simulated:
         remainders = remainders_of(model, measured, recording.train, recording.outputs, scales)
         model, scales = remainders.model, remainders.scales
@@ -120,6 +123,7 @@ def setup(
         recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
         dt=model.dt, clocked=timed, at_least=4 if len(recording.train) < 4 else 1,
     )  # fmt: skip
+    windows = _filled(windows, model, stores, measured, scales)
     windows, spare = thinned(windows, most_rows) if most_rows is not None else (windows, None)
     if spare is not None and most_rows is not None:
         # whole episodes are held out where there are enough, and of very long records a part tells enough
@@ -146,7 +150,9 @@ def setup(
     effect_rows = np.arange(len(model.params), n_p)  # parameters of effects
     span = coordinates.high[effect_rows] - coordinates.low[effect_rows]
     # not cut to the bounds: a neutral value may lie beyond them
-    start[effect_rows] = (augmented.neutral[effect_rows] - coordinates.low[effect_rows]) / np.where(span > 0, span, 1.0)
+    neutral = augmented.neutral[effect_rows]
+    neutral = np.where(coordinates.log[effect_rows], np.log(np.maximum(neutral, 1e-300)), neutral)
+    start[effect_rows] = (neutral - coordinates.low[effect_rows]) / np.where(span > 0, span, 1.0)
     start[n_p : n_p + n_r] = coordinates.unit(np.arange(n_p, n_p + n_r), r)
     start[n_p + n_r : n_p + n_r + n_q] = coordinates.unit(np.arange(n_p + n_r, n_p + n_r + n_q), 0.5 * typical)
     return Setup(augmented, rule, coordinates, windows, spare, scales, start, lead, substeps, timed)
@@ -166,12 +172,26 @@ def terms_of(model: Model, recording: Recording, effects: Sequence[Expression], 
     measured = measured_of(model, recording)
     scales = scales_of(model, recording.train, measured, recording.outputs)
     try:
-        named = [t for e in effects for t in e.attach(model, scales, measured)]
+        named = [t for e in effects if not e.states for t in e.attach(model, scales, measured)]
     except ModelError as error:
         raise ConfigError(str(error)) from error
     # what is late already is calibrated: a second delay of the same signal could not be distinguished from the first
     late = {DELAY: model.delay, LAG: model.lag, SENSOR_DELAY: model.sensor_delay, SENSOR_LAG: model.sensor_lag}
     return [t for t in named if t.acts_on not in late.get(t.kind, ())] + unnamed(model, scales, pairs=pairs)
+
+
+def with_memory(model: Model, recording: Recording, effects: Sequence[Expression]) -> list[Term]:
+    """Return every effect that brings a state along, at every place: no program carries them all.
+
+    Raises:
+        ConfigError: an effect that names what the model does not have.
+    """
+    measured = measured_of(model, recording)
+    scales = scales_of(model, recording.train, measured, recording.outputs)
+    try:
+        return [t for e in effects if e.states for t in e.attach(model, scales, measured)]
+    except ModelError as error:
+        raise ConfigError(str(error)) from error
 
 
 def questions(model: Model) -> list[Term]:
@@ -250,10 +270,42 @@ def whole_windows(
     Windows are equally long: beside many short episodes a very long one is cut, so that not most of them is padding.
     """
     model, longest = plan.augmented.model, longest or windows_.LONGEST_RUN
+    measured, stores = plan.augmented.measured, stores_of(plan.augmented.terms)
     while longest > windows_.LONGEST_RUN and padded([len(e.time) for e in episodes], longest) > MOST_PADDED:
         longest //= 2
-    return windows_of(
-        episodes, [q.name for q in model.states], plan.augmented.measured, outputs, centre_of(model), plan.windows.spread[0],
+    whole = windows_of(
+        episodes, [q.name for q in model.states], measured, outputs, centre_of(model), plan.windows.spread[0],
         lead=plan.lead, dt=model.dt, clocked=plan.clocked,
         longest=longest,
     )  # fmt: skip
+    return _filled(whole, model, stores, measured, plan.scales)
+
+
+def _with_sizes(scales: Scales, stores: Sequence[Store]) -> Scales:
+    """Return scales with those of states that effects bring along; no noise acts on these, whatever their rates are."""
+    size = {s.name: max(abs(s.low), abs(s.high), 1e-12) for s in stores}
+    return scales._replace(size=scales.size | size, rate=scales.rate | size)
+
+
+def _filled(
+    windows: Windows, model: Model, stores: Sequence[Store], measured: Sequence[str], scales: Scales
+) -> Windows:
+    """Return windows in which states that effects bring along begin at what they follow, as if it had long been so.
+
+    How far they are from it is not known: as far as that moves on the whole.
+    """
+    states, inputs = [q.name for q in model.states], [q.name for q in model.inputs]
+    start, spread = windows.start.copy(), windows.spread.copy()
+    for store in stores:
+        i = states.index(store.name)
+        start[:, i], spread[:, i] = 0.0, EMPTY * scales.size[store.name]
+        if store.begins in inputs:
+            first = windows.u[:, windows.lead, inputs.index(store.begins)]
+            start[:, i], spread[:, i] = first, np.std(windows.u[..., inputs.index(store.begins)])
+        elif store.begins in states:
+            start[:, i] = windows.start[:, states.index(store.begins)]
+            there = store.begins in measured
+            values = windows.y[..., measured.index(store.begins)] if there else np.zeros(0)
+            known = values[windows.ok[..., measured.index(store.begins)] > 0] if there else values
+            spread[:, i] = np.std(known) if len(known) else scales.size[store.begins]
+    return windows._replace(start=start, spread=np.maximum(spread, 1e-12))

@@ -1,18 +1,15 @@
 """An effect written as an expression: every effect of the catalogue, and a user's own, is one YAML file of this form."""
 
-import ast
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import casadi
-
+from simulators.effects.names import names_in, renamed, value_in
+from simulators.effects.stores import check_states, stores_at
 from simulators.effects.structure import drives, structure
 from simulators.effects.term import INPUT, NAMED, RATE, SENSOR, EffectParameter, Term
 from simulators.effects.units import per, unit_in
 from simulators.effects.vehicle import PARTS, Vehicle, vehicle
-from simulators.expression import RESERVED, parse
 from simulators.groups import Grouping, grouping
 from simulators.model import Model, ModelError
 from simulators.quantity import Quantity
@@ -50,10 +47,10 @@ class Expression:
         term: what is added to the rate of a state, or what stands in place of an input or a measured quantity. Roles can
             be used for names: `v` the velocity acted on, `s` its position, `x` the first-order state, `other` another
             state of the same unit, `around` an input of the same unit, `drive` an input that pushes the velocity from
-            standstill, `u` the input, `y` the measured quantity, `rate` the model's own rate, `zero` the absolute zero in the
-            unit of a temperature, `load` of a `supply` the mean magnitude of its inputs. For `planar` a mapping
-            {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the accelerations along, across and about the
-            vehicle, and to the rate of a heading without inertia, each where the model has it; names are `long`, `lat`,
+            standstill, `given` any input, `u` the input, `y` the measured quantity, `rate` the model's own rate, `zero` the
+            absolute zero in the unit of a temperature, `load` of a `supply` the mean magnitude of its inputs. For `planar` a
+            mapping {long: ..., lat: ..., yaw: ..., heading: ...}: what is added to the accelerations along, across and about
+            the vehicle, and to the rate of a heading without inertia, each where the model has it; names are `long`, `lat`,
             `yaw`, `heading` and the model's own `rate_long`, `rate_lat`, `rate_yaw` in these axes.
         operator: in place of `term`: delay, lag, backlash, rate_limit, sensor_delay or sensor_lag, on the signal that it acts
             on, with one parameter.
@@ -61,6 +58,9 @@ class Expression:
         parameters: name -> {range: [low, high], unit, neutral: 0, starts: [...]}. Numbers, or expressions of the scales A
             (typical rate), V, S, X, U, Y (largest magnitude of v, s, x, u, y) and dt. Units likewise: `A/V`. For planar:
             A, V of the vehicle's speed, W, Q of its yaw rate (largest magnitude, typical rate).
+        states: states that it brings along, which nothing measures: name -> {rate, unit, range: [low, high], begins}. `rate`
+            is theirs, in the names of the term; they begin at the first value of the quantity `begins`, or at 0. A search tries
+            such an effect where what it leaves has a memory.
         per: column of the measurements that names groups, from one to another of which its strength differs: the parameters
             that are 0 where it is switched off (all, where there are none) have a common value and one per group.
         same_as: effects that no data can tell from this one.
@@ -88,6 +88,7 @@ class Expression:
     mutual: bool = False
     passes: str = ""
     per: str = ""
+    states: Mapping[str, Any] = field(default_factory=dict)
     widened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -112,20 +113,21 @@ class Expression:
         if (
             isinstance(self.term, str)
             and self.term
-            and len(both := _names(self.term) & {"other", "around", "drive"}) > 1
+            and len(both := names_in(self.term) & {"other", "around", "drive", "given"}) > 1
         ):
             raise ModelError(
                 f"{where}.term: {self.term!r} has both `{'` and `'.join(sorted(both, reverse=True))}`; one effect is an "
                 "exchange with one"
             )
-        if self.passes and (self.mutual or not isinstance(self.term, str) or "other" in _names(self.term or "0")):
+        if self.passes and (self.mutual or not isinstance(self.term, str) or "other" in names_in(self.term or "0")):
             raise ModelError(f"{where}.passes: goes with a `term` of `x` alone that is not `mutual`")
-        if self.mutual and not (isinstance(self.term, str) and self.term and "other" in _names(self.term)):
+        if self.mutual and not (isinstance(self.term, str) and self.term and "other" in names_in(self.term)):
             raise ModelError(f"{where}.mutual: its term has no `other`, from whose rate it could be taken")
         if not isinstance(self.per, str) or not (self.per.isidentifier() or not self.per):
             raise ModelError(f"{where}.per: {self.per!r} is not the name of a column (letters, digits, underscores)")
         if self.per and self.operator:
             raise ModelError(f"{where}.per: a {self.operator} is the same for all groups; leave `per` out")
+        check_states(where, self.states, plain=bool(self.term) and not parts and not self.mutual and not self.passes)
         for name, node in self.parameters.items():
             if not (
                 isinstance(node, Mapping) and isinstance(node.get("range"), list | tuple) and len(node["range"]) == 2
@@ -153,8 +155,8 @@ class Expression:
         if isinstance(self.term, Mapping):
             car = vehicle(model)
             return self._on_vehicle(self.term, car, model, scales) if car else []
-        if "drive" in _names(self.term or "0") and (car := vehicle(model)):  # along its heading, wherever that points
-            along, pushed = {"long": _renamed(self.term, {"v": "long"})}, drives(model)
+        if "drive" in names_in(self.term or "0") and (car := vehicle(model)):  # along its heading, wherever that points
+            along, pushed = {"long": renamed(self.term, {"v": "long"})}, drives(model)
             motors = dict.fromkeys(motor for state in car.parts["long"] for motor in pushed[state])
             return [t for motor in motors for t in self._on_vehicle(along, car, model, scales, motor)]
         roles = structure(model)
@@ -198,7 +200,7 @@ class Expression:
     ) -> list[Term]:
         states, zero = [q.name for q in model.states], ZERO.get(units[name])
         kind = self.operator or self.kind or KIND_OF_ROLE.get(place) or _kind(name, model, place)
-        names = _names(term) if term else set()
+        names = set().union(*map(names_in, [*([term] if term else []), *(s["rate"] for s in self.states.values())]))
         if (
             ("s" in names and position is None and "s" not in units)
             or ("S" in str(self.parameters) and position is None)
@@ -206,11 +208,13 @@ class Expression:
         ):
             return []
         periodic = {q.name for q in model.states if q.periodic}
-        role = "other" if self.passes else next((r for r in ("other", "around", "drive") if r in names), "")
+        role = "other" if self.passes else next((r for r in ("other", "around", "drive", "given") if r in names), "")
         among = {"other": states, "around": [q.name for q in model.inputs]}.get(role, [])
         others = [n for n in among if n != name and units[n] == units[name]] if role else [""]
         if role == "drive":
             others = [*drives(model).get(name, ())]
+        if role == "given":
+            others = [q.name for q in model.inputs if q.name not in model.covariates]
         if self.passes:
             others = [n for n in others if n in structure(model).first_order]
         if self.mutual:
@@ -234,24 +238,28 @@ class Expression:
             values["S"] = 3.141592653589793
         found = []
         for other in others:
-            if role == "drive":
+            if role in ("drive", "given"):
                 values["U"], unit_of["U"] = size[other], units[other]
-            parameters = self._parameters(f"{self.name}_{name}" + (f"_{other}" if other else ""), values, unit_of)
+            prefix = f"{self.name}_{name}" + (f"_{other}" if other else "")
+            parameters = self._parameters(prefix, values, unit_of)
             swap = own | {role: other} | {k.label: k.name for k in parameters}
-            text = _renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
+            swap |= {label: f"{prefix}_{label}" for label in self.states}
+            text = renamed(term, {k: v for k, v in swap.items() if v is not None}) if term else ""
             if self.mutual:
                 first, second = sorted((name, other), key=states.index)
                 if first != name:  # the same term, whichever of the two was named
                     parameters = self._parameters(f"{self.name}_{first}_{second}", values, unit_of)
-                    text = _renamed(term, {"x": first, role: second} | {k.label: k.name for k in parameters})
+                    text = renamed(term, {"x": first, role: second} | {k.label: k.name for k in parameters})
                 both = ((first, text), (second, f"-({text})"))
                 found.append(self._term(f"{first}, {second}", kind, "", parameters, model, both))
             elif self.passes:
-                share = _renamed(self.passes, {k.label: k.name for k in parameters})
+                share = renamed(self.passes, {k.label: k.name for k in parameters})
                 both = ((name, text), (other, f"-({share})*({text})"))
                 found.append(self._term(f"{name}, {other}", kind, "", parameters, model, both))
             else:
-                found.append(self._term(name, kind, text, parameters, model))
+                there = {k: v for k, v in swap.items() if v is not None}
+                stores = stores_at(f"effect.{self.name}", self.states, there, values, unit_of)
+                found.append(self._term(name, kind, text, parameters, model)._replace(stores=stores))
         return found
 
     def _on_supply(self, term: str, model: Model, scales: Scales, units: dict[str, str]) -> list[Term]:
@@ -271,7 +279,7 @@ class Expression:
             parameters = self._parameters("_".join([self.name, *names]), values, unit_of)
             swap = {"load": "((" + " + ".join(f"abs({n})" for n in names) + f")/{len(names)})"}
             swap |= {k.label: k.name for k in parameters}
-            several = tuple((n, _renamed(term, swap | {"u": n})) for n in names)
+            several = tuple((n, renamed(term, swap | {"u": n})) for n in names)
             found.append(self._term(", ".join(names), INPUT, "", parameters, model, several))
         return found
 
@@ -296,7 +304,7 @@ class Expression:
             values["U"] = scales.size[drive]
             unit_of["U"] = next(q.unit for q in model.inputs if q.name == drive)
         states = [q.name for q in model.states if any(q.name in car.parts[part] for part in own)]
-        used = set().union(*(_names(text) for text in own.values()))
+        used = set().union(*(names_in(text) for text in own.values()))
         parameters = self._parameters(
             "_".join([self.name, *states, *([drive] if drive else [])]), values, unit_of, used
         )
@@ -304,7 +312,7 @@ class Expression:
         sums: dict[str, list[str]] = {state: [] for state in states}
         for part, text in own.items():
             for state, factor in car.parts[part].items():
-                push = f"({_renamed(text, swap)})"
+                push = f"({renamed(text, swap)})"
                 sums[state].append(push if factor == "1" else f"{factor}*{push}")
         several = tuple((state, " + ".join(terms)) for state, terms in sums.items())
         return [self._term(", ".join(states), RATE, "", parameters, model, several)]
@@ -317,14 +325,21 @@ class Expression:
         for label, node in self.parameters.items():
             if used is not None and label not in used:
                 continue
-            low, high = (_value(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
+            low, high = (value_in(v, values, f"effect.{self.name}.parameters.{label}.range") for v in node["range"])
             low, high = self.widened.get(f"{prefix}_{label}", (low, high))
-            null = _value(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
+            null = value_in(node.get("neutral", 0), values, f"effect.{self.name}.parameters.{label}.neutral")
             given = node.get("starts") or [0.1 * high + 0.9 * max(low, 0.0)]
-            starts = tuple(_value(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
+            starts = tuple(value_in(v, values, f"effect.{self.name}.parameters.{label}.starts") for v in given)
             parameters.append(
                 EffectParameter(
-                    f"{prefix}_{label}", label, unit_in(node.get("unit", ""), unit_of), low, high, null, starts
+                    f"{prefix}_{label}",
+                    label,
+                    unit_in(node.get("unit", ""), unit_of),
+                    low,
+                    high,
+                    null,
+                    starts,
+                    node.get("prior", "uniform"),
                 )
             )
         return tuple(parameters)
@@ -370,21 +385,3 @@ def _kind(name: str, model: Model, place: str) -> str:
     if any(q.name == name for q in model.inputs):
         return INPUT
     return RATE if any(q.name == name for q in model.states) else SENSOR
-
-
-def _names(text: str) -> set[str]:
-    return {node.id for node in ast.walk(ast.parse(text, mode="eval")) if isinstance(node, ast.Name)} - RESERVED
-
-
-def _renamed(text: str, swap: Mapping[str, str]) -> str:
-    """Replace whole names in an expression."""
-    return re.sub(r"(?<![\w.])[A-Za-z_]\w*", lambda m: swap.get(m[0], m[0]), text)
-
-
-def _value(value: Any, scales: Mapping[str, float], path: str) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    try:
-        return float(parse(str(value), {name: casadi.SX(scale) for name, scale in scales.items()}))
-    except ValueError as error:
-        raise ModelError(f"{path}: {error}") from None

@@ -6,7 +6,7 @@ import casadi
 import numpy as np
 
 from simulators.model import Model
-from simulators.quantity import READING
+from simulators.quantity import HIDDEN, READING
 
 VELOCITIES = ("m/s", "rad/s", "deg/s", "1/min", "rpm")  # units that nothing else than a velocity has
 SAME = 1e-9  # of a rate: below, rounding
@@ -17,7 +17,8 @@ class Structure(NamedTuple):
     """Roles of a model's states.
 
     Args:
-        kinematic: rates that hold by definition (a position's rate is a velocity; a reading follows); no force acts there.
+        kinematic: rates that hold by definition (a position's rate is a velocity; a reading follows; a hidden state does what
+            its equation says); no force acts there.
         velocity: rates that forces act on -> the state that this one is the rate of, or None where there is none.
         first_order: all other rates: levels, temperatures, concentrations.
         inferred: state -> what its role was read off, where nothing was declared and it is not first-order.
@@ -45,11 +46,11 @@ def structure(model: Model) -> Structure:
     identity = _identities(model)
     kinematic: dict[int, int | None] = {}
     for i, q in enumerate(model.states):
-        declared = q.role in ("position", READING)
+        declared = q.role in ("position", READING, HIDDEN)
         if q.role and not declared:
             continue
         source = None
-        if q.role != READING and not on_p[i].any() and not on_u[i].any():
+        if q.role not in (READING, HIDDEN) and not on_p[i].any() and not on_u[i].any():
             others = [j for j in np.flatnonzero(on_x[i]) if j != i and units[j]]
             of_rate = [int(j) for j in others if units[j] == _plain(f"{units[i]}/s")]
             source = of_rate[0] if of_rate else identity.get(i)

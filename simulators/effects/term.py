@@ -31,6 +31,26 @@ class EffectParameter(NamedTuple):
     prior: str = "uniform"
 
 
+class Store(NamedTuple):
+    """A state that an effect brings along, which nothing measures.
+
+    Args:
+        name: unique in the model.
+        unit: of it.
+        low: end of its range.
+        high: the other.
+        rate: its rate, in the names of the model, of the parameters and its own.
+        begins: quantity of the model at whose first value it begins; empty: at 0.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    rate: str
+    begins: str = ""
+
+
 class Term(NamedTuple):
     """One effect at one place.
 
@@ -52,6 +72,7 @@ class Term(NamedTuple):
         groupings: how its parameters differ from group to group.
         several: of a term on several rates: (state, expression), in which `rate_STATE` is the model's own rate; of one on
             several inputs: (input, expression).
+        stores: states that it brings along.
     """
 
     effect: str
@@ -67,6 +88,7 @@ class Term(NamedTuple):
     constants: tuple[tuple[str, float], ...] = ()
     several: tuple[tuple[str, str], ...] = ()
     groupings: tuple[Grouping, ...] = ()
+    stores: tuple[Store, ...] = ()
 
     @property
     def label(self) -> str:
@@ -76,7 +98,7 @@ class Term(NamedTuple):
     @property
     def rates(self) -> dict[str, str]:
         """State -> what is added to its rate."""
-        return self._places if self.kind == RATE else {}
+        return (self._places if self.kind == RATE else {}) | {s.name: s.rate for s in self.stores}
 
     @property
     def inputs(self) -> dict[str, str]:

@@ -116,12 +116,13 @@ def terms_of(name: str) -> list[tuple[Model, Term]]:
 def values(
     model: Model, term: Term, x: list[float], u: list[float], parameters: list[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rates and readings with one term, parameters in the middle of their ranges."""
+    """Rates of the model's own states and readings with one term, parameters in the middle of their ranges."""
     together = augment(model, [term], [q.name for q in model.states])
     begin = len(model.params)  # behind the parameters: constants
     p = np.concatenate([together.neutral[:begin], parameters, together.neutral[begin + len(parameters) :]])
-    rates, y = together.function(casadi.DM(x), casadi.DM(u), casadi.DM(p))
-    return np.asarray(rates).ravel(), np.asarray(y).ravel()
+    away = [0.7 * s.high for s in term.stores]  # what it brings along is not where the states are
+    rates, y = together.function(casadi.DM([*x, *away]), casadi.DM(u), casadi.DM(p))
+    return np.asarray(rates).ravel()[: len(x)], np.asarray(y).ravel()
 
 
 def points(model: Model, seed: int = 0) -> list[tuple[list[float], list[float]]]:

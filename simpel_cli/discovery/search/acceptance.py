@@ -75,9 +75,10 @@ def gated_selection(
 ) -> tuple[Selection, list[Gate], list[int]]:
     """Judge on held-out episodes what every effect adds to the others; of those that fail one goes at a time.
 
-    Effects that are of use only together, as a delay and a slip, are judged together so. Of two that can stand for each other
-    the one with less evidence goes, and the other is judged without it. Few held-out parts cannot tell of every member of a
-    set whether it helps: one of strong evidence that helps there on the whole stays where the set certainly does.
+    Effects that are of use only together, as a delay and a slip, are judged together so. Of those that do harm the one goes
+    that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
+    for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
+    member of a set whether it helps: one of strong evidence that helps there on the whole stays where the set certainly does.
 
     Returns:
         what is left of the selection, its gates, and the terms with which an error grows.
@@ -92,7 +93,8 @@ def gated_selection(
         if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
             (whole,) = gates(search, assessor, chosen, [selection.base])
             failed = [] if whole.passed else failed
-        gone = min(failed, key=lambda i: (not judged[i].harm, selection.gains[i]), default=None)
+        harm = [i for i in failed if judged[i].harm]
+        gone = min(harm or failed, key=lambda i: judged[i].gain if harm else selection.gains[i], default=None)
         for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
             _report_gate(search.terms[term].label, found, terminal, out=i == gone)
         if gone is None:

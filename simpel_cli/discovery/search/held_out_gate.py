@@ -19,6 +19,7 @@ LEAST_BLOCKS = 20
 LEAST_OF_BLOCK = 8  # rows
 ORDINARY = 0.9  # of the blocks: larger gains and losses than these have are odd
 MOST_FOLDS = 5
+AMPLE = 2.0  # times the rows that a search looked at: so many that it left out
 LEAST_PARTS = 8  # of which an error that falls can pass an effect
 TOLERATED = {"one_step": 0.1, "ahead": 0.02, "free": 0.02}  # of an error: so much it may grow
 SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
@@ -58,7 +59,8 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     """Return what a model gains over others that lack a part of it, on episodes that they were not fitted to.
 
     All are refitted on all but a fold of the training episodes and score that fold, for every fold. Of a few long episodes
-    windows are held out, and those that the search left out as well: they tell more, and no parameter has to be fitted again.
+    windows are held out, and those that the search left out as well: no parameter has to be fitted again. Where these are
+    `AMPLE`, they are enough.
     A model that is nearly right and very sure of it loses hundreds of nats on one odd episode. So the levels of the
     noise, which all models have, are fitted to the fold itself (not of a short record, whose blocks lie between others);
     parameters and effects are not.
@@ -79,9 +81,10 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     groups = windows.episode if unit == "episode" else np.arange(len(windows.episode))
     order = np.random.default_rng(0).permutation(np.unique(groups))
     # a single window cannot be held out: there is nothing else to fit to
-    folds = (
-        [np.isin(groups, part) for part in np.array_split(order, min(MOST_FOLDS, len(order)))] if len(order) > 1 else []
-    )
+    spare = search.plan.spare if unit == "window" else None
+    enough = spare is not None and (spare.ok > 0).sum() >= AMPLE * (windows.ok > 0).sum()
+    alone = enough or len(order) == 1
+    folds = [] if alone else [np.isin(groups, p) for p in np.array_split(order, min(MOST_FOLDS, len(order)))]
     hypotheses = [Hypothesis(t.optimum.z, t.optimum.free, 1.0 - out) for out in folds for t in trials]
     found = search.fitter(hypotheses)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out. What a group is that
@@ -99,8 +102,8 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
         (windows, out, groups[out], found[i * len(trials) : (i + 1) * len(trials)], prices[i * len(trials) :])
         for i, out in enumerate(folds)
     ]
-    if unit == "window" and search.plan.spare is not None:
-        for names, part, out in _batches(search.plan.spare, len(groups)):
+    if spare is not None:
+        for names, part, out in _batches(spare, len(groups)):
             fits = search.fitter.on(part)([Hypothesis(t.optimum.z, search.noise, out.astype(float)) for t in trials])
             scored.append((part, out, len(groups) + names, fits, [np.zeros(len(out))] * len(trials)))
     if not scored:

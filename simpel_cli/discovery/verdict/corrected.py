@@ -13,7 +13,7 @@ from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simulators.effects import Term
 from simulators.effects.term import BACKLASH, DELAY, LAG, ON_SENSOR, RATE_LIMIT, SENSOR, SENSOR_DELAY
 from simulators.model import Declared, Model, ModelError
-from simulators.quantity import READING
+from simulators.quantity import HIDDEN, READING
 from simulators.readings import line_of
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
@@ -23,6 +23,7 @@ PAST = {
     BACKLASH: "the position within the play depends on all past inputs, which a single transition does not contain",
     RATE_LIMIT: "where the actuator is depends on all past inputs, which a single transition does not contain",
 }
+OWN = "it has a state of its own, and only a simulator in YAML without sensors can be given one more"
 FOLLOWS = "a lagging reading follows what it reads by a law of its own, to which nothing is added"
 
 
@@ -46,7 +47,18 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
     taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
     readings = {q.name for q in model.states if q.role == READING}
-    cannot = {t: FOLLOWS if readings & t.rates.keys() else PAST.get(t.kind) or no_line(t, model) for t in terms}
+    # where sensors are declared, terms act on what these show
+    plain = sim.get("_target_", DECLARED) == DECLARED and not sim.get("sensors")
+    own_outputs = (sim.get("outputs") or {}).keys() if plain else ()
+
+    def why_not(term: Term) -> str | None:
+        if term.stores and not plain:
+            return OWN
+        if term.stores and term.kind == SENSOR and term.acts_on in own_outputs:
+            return None
+        return FOLLOWS if readings & term.rates.keys() else PAST.get(term.kind) or no_line(term, model)
+
+    cannot = {t: why_not(t) for t in terms}
     spread = {one.row: one for one in differing(search, trial)}
     written: list[Term] = []
     names: dict[str, str] = {}
@@ -72,8 +84,6 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             if row in spread and low < high:
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
-    # where sensors are declared, terms act on what these show
-    plain = sim.get("_target_", DECLARED) == DECLARED and not sim.get("sensors")
     node = (_declared if plain else _extended)(sim, name, written, names, parameters)
     sensors = shown(written, names, model, search.plan.augmented.measured)
     node |= {"sensors": sensors} if sensors else {}
@@ -118,7 +128,7 @@ def _declared(
             given[signal] = f"({_renamed(text, names | {signal: given.get(signal, signal)})})"
     # the rates of the simulator with the changed inputs: every term adds to these, and takes its rates from these
     base = {state: _renamed(str(text), given) for state, text in node["dynamics"].items()}
-    rates = {f"rate_{state}": f"({text})" for state, text in base.items()}
+    rates, rates_of = {f"rate_{state}": f"({text})" for state, text in base.items()}, set(base)
     node["dynamics"] = dict(base)
     for section in ("intermediates", "outputs"):
         for key, own in (node.get(section) or {}).items():
@@ -126,7 +136,18 @@ def _declared(
             node[section][key] = own | {"expression": new} if isinstance(own, dict) else new
     _look_up_changed_inputs(node, given)
     for term in terms:
+        for store in term.stores:
+            node["states"][store.name] = {"unit": store.unit, "range": [store.low, store.high], "role": HIDDEN}
+            node["dynamics"][store.name] = _renamed(store.rate, names | given)
+        if term.stores and term.kind == SENSOR and term.acts_on in (node.get("outputs") or {}):
+            own = node["outputs"][term.acts_on]
+            before = own["expression"] if isinstance(own, dict) else own
+            text = _renamed(term.expression, names | given | {term.acts_on: f"({before})"})
+            node["outputs"][term.acts_on] = own | {"expression": text} if isinstance(own, dict) else text
+    for term in terms:
         for state, text in term.rates.items():
+            if state not in rates_of:
+                continue
             swap = names | given | (rates if term.several else {"rate": rates[f"rate_{state}"]})
             node["dynamics"][state] += f" + ({_renamed(text, swap)})"
     return node
@@ -159,7 +180,7 @@ def shown(
     found: dict[str, dict[str, str]] = {}
     of_position = {p: v for v, positions in speeds(model).items() if v not in measured for p in positions}
     for term in terms:
-        if term.kind not in (SENSOR, *ON_SENSOR):
+        if term.kind not in (SENSOR, *ON_SENSOR) or term.stores:
             continue
         for place in (term.acts_on, *(v for p, v in of_position.items() if p == term.acts_on)):
             own = found.get(place, {})

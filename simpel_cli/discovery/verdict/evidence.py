@@ -180,7 +180,8 @@ def _coverage(search: Search, recording: Recording) -> Columns:
     inputs = np.concatenate([e.inputs for e in recording.train])
     slots = _slots(model)  # which group a row is of has no range
     rows = []
-    for values, group in ((states, model.states), (inputs, model.inputs)):
+    # what effects bring along stands last, and has no column
+    for values, group in ((states, model.states[: states.shape[1]]), (inputs, model.inputs)):
         for j, q in enumerate(group):
             if q.name in recording.estimated or q.name in slots or not np.isfinite(values[:, j]).any():
                 continue

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
-from simulators.effects import Structure, Term, structure
+from simulators.effects import Structure, Term, stores_of, structure, with_stores
 from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, SENSOR, SENSOR_DELAY, SENSOR_LAG
 from simulators.expression import parse
 from simulators.model import Model, Quantity
@@ -20,7 +20,7 @@ class Augmented(NamedTuple):
     """A model with candidate terms.
 
     Args:
-        model: the simulator as it was.
+        model: the simulator as it was, with the states that terms bring along.
         terms: candidates.
         measured: names of the measured states and outputs, the rows of a measurement.
         function: CasADi function (x, u, p) -> (d(x)/dt, measured); p: parameters of the model, then of all effects,
@@ -76,7 +76,7 @@ def augment(
         measured: names of the measured states and outputs.
         remainders: measured channel -> state that is added to what its sensor reads (see `remainders`).
     """
-    remainders = remainders or {}
+    remainders, model = remainders or {}, with_stores(model, stores_of(terms))
     params = [*model.params]
     neutral = [centre(q) for q in model.params]
     for term in terms:

@@ -79,6 +79,7 @@ class Coordinates(NamedTuple):
 
 DECLARED_SD = 0.1  # of the logarithm of a measurement noise that the user declared
 ESTIMATED_SPAN = (1 / 30, 3.0)  # factors within which a noise that was estimated from differences may lie
+LOG_UNIFORM = "loguniform"  # prior of an effect's parameter: a time constant may be of any magnitude
 MODEL_ERROR = 0.01  # of a channel's magnitude, which its noise may reach however clean its differences are
 
 
@@ -109,7 +110,9 @@ def coordinates_of(
     for i, q in enumerate(augmented.params):
         prior = q.prior if i < base or q.prior == "normal" else "uniform"
         low, high = (np.log(q.low), np.log(q.high)) if prior == "lognormal" else (q.low, q.high)
-        if prior == "uniform":
+        if i >= base and q.prior == LOG_UNIFORM:
+            rows.append((np.log(q.low), np.log(q.high), True, False))
+        elif prior == "uniform":
             rows.append((low, high, False, False))
         else:
             middle, sd = (low + high) / 2, (high - low) / 4

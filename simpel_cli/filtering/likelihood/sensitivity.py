@@ -19,7 +19,10 @@ from simpel_cli.filtering.likelihood.track import Track
 from simulators.effects import Term
 
 
-def shifts(track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarray, row: int, dt: float) -> np.ndarray:
+def shifts(
+    track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarray, row: int, dt: float,
+    reading: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return the change of every innovation per unit of each force, (W, T, ny, n); 0 where nothing was measured.
 
     Args:
@@ -29,6 +32,7 @@ def shifts(track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarra
         following: (W, T, n) at the states predicted from them.
         row: of the state whose rate the forces act on.
         dt: s.
+        reading: (W, T, ny, n) what is added to what sensors read; None: nothing.
     """
     count, rows, nx = track.mean.shape
     n = force.shape[-1]
@@ -39,7 +43,8 @@ def shifts(track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarra
         for j in range(ok.shape[2]):
             h = track.slope[:, k, j]
             measured = ok[:, k, j, None] > 0
-            change = np.where(measured, -np.einsum("wi,win->wn", h, d), 0.0)
+            shown = np.einsum("wi,win->wn", h, d) + (0.0 if reading is None else reading[:, k, j])
+            change = np.where(measured, -shown, 0.0)
             found[:, k, j] = change
             gain = np.einsum("wij,wj->wi", cov, h)
             pull = np.where(measured, gain / track.variance[:, k, j, None], 0.0)

@@ -1,0 +1,151 @@
+"""Hidden states: what a chosen model leaves has a memory of a state that the simulator lacks."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from command_line import TINY, simpel
+from scipy.integrate import solve_ivp
+
+from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
+from simpel_cli.filtering.likelihood.augmented import augment
+from simulators.effects import Expression, Scales
+from simulators.effects.stores import with_stores
+from simulators.model import Model, ModelError
+
+DT, AMBIENT = 2.0, 22.0
+HEATER = """name: heater
+dt: 2.0
+states: {T: {unit: degC, range: [10, 80], role: temperature}}
+inputs: {u: {unit: "1", range: [0, 1]}}
+parameters: {a: {unit: 1/s, range: [0.005, 0.06]}, b: {unit: K/s, range: [0.3, 1.5]}}
+dynamics: {T: a*(22 - T) + b*u}
+"""
+DATA = "path: {path}\ntime: t\nepisode: episode\nsplit: {{column: split}}\n"
+WALL = {"k": 0.03, "tau": 60.0}
+
+
+def heaters(k: float, tau: float, seed: int = 3) -> pd.DataFrame:
+    """Rows of a heater that exchanges heat with a wall."""
+    random, parts = np.random.default_rng(seed), []
+    for episode in range(6):
+        u = np.repeat(random.uniform(0, 1, 5), 16)
+        x = np.full(2, random.uniform(20, 30))
+        rows = []
+        for held in u:
+            rows.append(x[0])
+
+            def rate(_: float, x: Any, held: float = held) -> list[float]:
+                return [0.02 * (AMBIENT - x[0]) + 0.8 * held + k * (x[1] - x[0]), (x[0] - x[1]) / tau]
+
+            x = solve_ivp(rate, (0, DT), x, rtol=1e-8).y[:, -1]
+        measured = np.array(rows) + 0.05 * random.normal(size=len(u))
+        split = "train" if episode < 4 else "test"
+        parts.append(
+            pd.DataFrame({"episode": episode, "t": DT * np.arange(len(u)), "T": measured, "u": u, "split": split})
+        )
+    return pd.concat(parts)
+
+
+def given(folder: Path, k: float) -> None:
+    for group in ("sim", "data"):
+        (folder / "my" / group).mkdir(parents=True)
+    (folder / "my/sim/heater.yaml").write_text(HEATER)
+    (folder / "my/data/heater.yaml").write_text(DATA.format(path=folder / "run.parquet"))
+    heaters(k, WALL["tau"]).to_parquet(folder / "run.parquet")
+
+
+EFFECTS = "effect=[ambient_exchange,radiation,input_lag,sensor_lag,hidden_exchange,after_effect,polarisation]"
+
+
+def searched(folder: Path) -> dict[str, Any]:
+    found = simpel(
+        folder, "discover", "--config-dir", "my", "sim=heater", "data=heater", EFFECTS, "report=false",
+        "discovery.pairs=false", "hydra.run.dir=run",
+    )  # fmt: skip
+    assert found.code == 0, found.err
+    verdict: dict[str, Any] = json.loads((folder / "run" / "verdict.json").read_text())
+    return verdict
+
+
+def test_a_wall_is_found_written_and_fitted(tmp_path: Path) -> None:
+    given(tmp_path, WALL["k"])
+    verdict = searched(tmp_path)
+    (effect,) = verdict["effects"]
+    assert effect["name"] == "hidden_exchange"
+    found = effect["parameters"]
+    for name, value in WALL.items():
+        assert found[name]["value"] == pytest.approx(value, rel=0.1)
+    file = tmp_path / "run" / verdict["corrected_sim"]
+    node = yaml.safe_load(file.read_text())
+    (hidden,) = (name for name in node["states"] if name != "T")
+    assert node["states"][hidden]["role"] == "hidden"
+    assert "state that nobody measures" in verdict["not_closed"]
+    fitted = simpel(
+        tmp_path, "fit", "--config-dir", "run/conf", f"sim={file.stem}", "data=heater", "hydra.run.dir=fit", *TINY
+    )
+    assert fitted.code == 0, fitted.err
+
+
+def test_without_a_wall_there_is_none(tmp_path: Path) -> None:
+    given(tmp_path, 0.0)
+    assert searched(tmp_path)["verdict"] == "none"
+
+
+def wall(**more: Any) -> Expression:
+    state = {"z": {"rate": "(x - z)/tau", "unit": "X", "range": ["-X", "X"], "begins": "x"}}
+    parameters = {
+        "k": {"range": [0, "A/X"], "unit": "A/X"}, "tau": {"range": [6, 600], "neutral": 60, "prior": "loguniform"},
+    }  # fmt: skip
+    return Expression(
+        "wall", **({"acts_on": "T", "term": "k*(z - x)", "states": state, "parameters": parameters} | more)
+    )
+
+
+def heater() -> Model:
+    from simulators.model import Declared
+
+    return Declared(**yaml.safe_load(HEATER)).model()
+
+
+def test_a_state_of_an_effect_does_what_its_equation_says() -> None:
+    model = heater()
+    (term,) = wall().attach(model, Scales({"T": 50.0, "u": 1.0}, {"T": 0.5}, DT), ("T",))
+    augmented = augment(model, [term], ("T",))
+    assert [q.name for q in augmented.model.states] == ["T", "wall_T_z"]
+    assert augmented.driven == (0,)  # no noise acts on it
+    p = augmented.neutral.copy()
+    p[augmented.rows(term)] = [0.03, 60.0]
+    rates, shown = (np.asarray(a).ravel() for a in augmented.function([30.0, 24.0], [0.5], p))
+    a, b = p[:2]
+    np.testing.assert_allclose(rates, [a * (22 - 30) + b * 0.5 + 0.03 * (24 - 30), (30 - 24) / 60])
+    assert shown == [30.0]
+    assert with_stores(augmented.model, term.stores) is augmented.model
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"states": {"z": {"rate": "x"}}}, r"effect.wall.states.z: .* write \{rate"),
+        (
+            {"states": {"z": {"rate": "x", "range": [0, 1], "start": 0}}},
+            r"states.z.start: no such key; allowed are rate",
+        ),
+        ({"term": "", "operator": "lag", "parameters": {"k": {"range": [0, 1]}}}, r"effect.wall.states: go with one"),
+    ],
+)
+def test_states_that_are_declared_wrongly_are_named(more: dict[str, Any], said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        wall(**more)
+
+
+def test_nothing_is_promised_where_no_effect_has_a_state() -> None:
+    nothing: Any = None
+    from inspect import unwrap
+
+    assert unwrap(worth_a_search)(nothing, nothing, []) is None
+    assert Memory((), 12.4).words.endswith("promises +12: searching once more with it")
