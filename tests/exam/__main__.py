@@ -8,6 +8,7 @@ measurements have the nuisances of real rigs.
 
 import argparse
 import json
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Mapping
@@ -25,7 +26,7 @@ from tests.exam.table import report
 from tests.exam.write import write
 
 PLAN = "exam.json"
-MOST_WORKERS = 2
+MOST_WORKERS = os.cpu_count() or 2
 TUNING, TUNING_SEED = 450, 1_000_003  # sets on which the rival's threshold is tuned; no set of the exam is among them
 STRONG = 0.25  # exponent of strengths: of two decades it leaves the upper half one
 
@@ -40,7 +41,14 @@ def main() -> None:
         "--only", nargs="+", choices=SYSTEMS, default=list(SYSTEMS), metavar="SYSTEM", help=str([*SYSTEMS])
     )
     parser.add_argument("--second", action="store_true", help="with nuisances of real rigs")
-    parser.add_argument("--workers", type=int, default=2, choices=range(1, MOST_WORKERS + 1))
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=2,
+        choices=range(1, MOST_WORKERS + 1),
+        metavar="N",
+        help="processes, each on a core",
+    )
     parser.add_argument("--score-only", type=Path, metavar="DIR", help="score the runs of an earlier exam anew")
     options = parser.parse_args()
     if (options.out is None) == (options.score_only is None):

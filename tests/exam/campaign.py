@@ -24,7 +24,7 @@ def neighbours(drawn: Set) -> tuple[int, str, tuple[str, ...], int]:
 
 
 def run(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], workers: int) -> None:
-    """Examine sets in few processes; one that dies takes the sets with it that it was at, and no others."""
+    """Examine sets in few processes, each on a core of its own; one that dies loses the sets that it was at, and no others."""
     everything = waiting
     while everything:  # fresh processes now and then; `max_tasks_per_child` can hang (CPython issue 115634)
         waiting, everything = everything[: SETS_PER_PROCESS * workers], everything[SETS_PER_PROCESS * workers :]
@@ -37,7 +37,10 @@ def _batch(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], wo
         begun = {d.index: out / "begun" / str(d.index) for d in waiting}
         for mark in begun.values():  # of an exam that was interrupted
             mark.unlink(missing_ok=True)
-        with ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(os.getpid(),)) as pool:
+        cores: Any = context.Queue()
+        for worker in range(workers):
+            cores.put(worker)
+        with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(os.getpid(), cores)) as pool:
             futures = {pool.submit(one, d, out, tuned): d for d in waiting}
             for future in as_completed(futures):
                 try:
@@ -55,8 +58,11 @@ def _batch(waiting: list[Set], out: Path, tuned: Mapping[str, Sequence[Any]], wo
         waiting = [d for d in left if d not in died]
 
 
-def _end_with(parent: int) -> None:
-    """End this process soon after its parent: a worker of an exam that was killed would go on and take a core."""
+def _begin(parent: int, cores: Any) -> None:
+    """Keep this process to one core, and end it soon after its parent: a worker of an exam that was killed would go on."""
+    if hasattr(os, "sched_setaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {mine[cores.get() % len(mine)]})
 
     def watch() -> None:
         while os.getppid() == parent:
