@@ -235,7 +235,7 @@ def _chosen_in(
     proposal = proposed(found.search, assessor, found.base, options, earlier=earlier)
     if (ends := wider(found.search, proposal.chosen)) is not None:
         return ends._replace(earlier=Earlier(found.search, proposal.chosen))
-    judged, gates = accepted(found.search, assessor, proposal, terminal)
+    judged, gates = accepted(found.search, assessor, proposal, terminal, options.for_ or ONE_STEP)
     left = judged.chosen.terms != proposal.chosen.terms  # what was refused may have made up for a range
     ends = wider(found.search, judged.chosen) if left else None
     return (judged, gates) if ends is None else ends._replace(earlier=Earlier(found.search, judged.chosen))
@@ -310,7 +310,7 @@ def _with(
         found, earlier = heavy, Earlier(found.search, selection.chosen)
         found.search.budget = ground.budget
         selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
-        selection, gates = accepted(found.search, assessor, selection, terminal)
+        selection, gates = accepted(found.search, assessor, selection, terminal, options.for_ or ONE_STEP)
     search, windows = found.search, found.test
     by_simulations = None
     if options.simulations and not ground.budget.over("a search by simulations"):

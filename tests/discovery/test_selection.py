@@ -302,6 +302,43 @@ def test_what_the_gate_refuses_hides_no_other_effect(
     assert [search.terms[t].effect for t in without] == list(again)
 
 
+def test_of_effects_that_do_harm_the_one_goes_first_that_gains_least_on_held_out_parts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    search: Any = Table({"": 0.0, "A": 30.0, "B": 90.0, "AB": 130.0}).search
+
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+        both = len(whole.terms) == 2
+        gain = {"A": 50.0, "B": 10.0}  # by evidence B is worth more
+        return [
+            Gate(gain[search.terms[t].effect], 1.0, 99.0, "episode", both, not both) for t in whole.terms[: len(parts)]
+        ]
+
+    monkeypatch.setattr(acceptance, "gates", judge)
+    kept, _, _ = gated_selection(search, Assessor(search.plan, 5), select(search), Terminal(True, tmp_path / "run.log"))
+    assert [search.terms[t].effect for t in kept.chosen.terms] == ["A"]
+
+
+@pytest.mark.parametrize(("use", "grows", "stays"), [("free_run", (), True), ("free_run", ("v in free run",), False),
+                                                     ("free_run", None, False), ("one_step", (), False)])  # fmt: skip
+def test_harm_is_what_is_left_of_it_with_both_models_calibrated_for_the_use(
+    use: str, grows: tuple[str, ...] | None, stays: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    search: Any = Table({"": 0.0, "A": 30.0}).search
+
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+        return [Gate(20.0, 5.0, 35.0, "episode", True, False, ("v some rows ahead",)) for _ in parts]
+
+    monkeypatch.setattr(acceptance, "gates", judge)
+    monkeypatch.setattr(acceptance, "growing_for", lambda *_: grows)
+    kept, judged, harmful = gated_selection(
+        search, Assessor(search.plan, 5), select(search), Terminal(True, tmp_path / "run.log"), use
+    )
+    assert bool(kept.chosen.terms) is stays
+    assert [g.passed for g in judged] == [True] * stays
+    assert len(harmful) == (not stays)
+
+
 def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     search: Any = Table({"": 0.0, "A": 30.0, "B": 2.0, "AB": 60.0}).search
 
@@ -394,7 +431,7 @@ def test_a_base_that_had_not_found_its_place_is_left_for_a_better_one() -> None:
 def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[str] = []
 
-    def gated(_: Any, __: Any, selection: str, ___: Any) -> tuple[str, list[str], list[int]]:
+    def gated(_: Any, __: Any, selection: str, *___: Any) -> tuple[str, list[str], list[int]]:
         judged.append(selection)
         return selection, [selection], [1]
 
@@ -418,7 +455,7 @@ def test_what_is_left_where_a_function_makes_an_effect_superfluous_is_judged_aga
     judged: list[tuple[int, ...]] = []
     both, one, none = (SimpleNamespace(chosen=SimpleNamespace(terms=terms)) for terms in ((1, 2), (1,), ()))
 
-    def gated(_: Any, __: Any, selection: Any, ___: Any) -> tuple[Any, list[str], list[int]]:
+    def gated(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[str], list[int]]:
         judged.append(selection.chosen.terms)
         return (none, [], []) if selection is one and refused else (selection, ["judged"], [])
 
@@ -457,7 +494,7 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
         asked_of.append(chosen.name)
         return wider if chosen.name == asks else None
 
-    def accept(_: Any, __: Any, selection: Any, ___: Any) -> tuple[Any, list[Any]]:
+    def accept(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
         judgements.append(selection)
         return judged, []
 
@@ -465,7 +502,8 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
     monkeypatch.setattr(searched_module, "accepted", accept)
     none: Any = None
     found: Any = SimpleNamespace(search=none, base=none)
-    outcome = unwrap(_chosen_in)(found, none, none, none, ends)
+    options: Any = SimpleNamespace(for_=None)
+    outcome = unwrap(_chosen_in)(found, none, options, none, ends)
     chosen = proposal.chosen if asks == "proposed" else judged.chosen
     assert outcome == (wider._replace(earlier=Earlier(none, chosen)) if asks else (judged, []))
     assert asked_of == questions

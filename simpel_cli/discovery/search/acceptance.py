@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 
 from simpel_cli.discovery.search.again import Earlier, path_in
+from simpel_cli.discovery.search.harm import growing_for
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.near import far
 from simpel_cli.discovery.search.sets.forward import further, selected, widely
@@ -13,6 +14,7 @@ from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.interactions import interaction
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.uses import ONE_STEP
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
@@ -44,15 +46,22 @@ def proposed(
 
 
 def accepted(
-    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP
 ) -> tuple[Selection, list[Gate]]:
     """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for.
 
     The rivals are named last, of what is accepted. Where a function without a name makes an effect superfluous, the others are
     judged without it.
+
+    Args:
+        search: over sets of effects.
+        assessor: of errors ahead.
+        selection: what is proposed.
+        terminal: takes lines.
+        use: what the model will be calibrated for in the end.
     """
     for attempt in range(MOST_SEARCHES):
-        selection, judged, harmful = gated_selection(search, assessor, selection, terminal)
+        selection, judged, harmful = gated_selection(search, assessor, selection, terminal, use)
         last = attempt == MOST_SEARCHES - 1 or (
             harmful and search.budget.over("what an effect that did harm stood for")
         )
@@ -65,13 +74,13 @@ def accepted(
         named = rivalled(search, selection)
         if named.chosen.terms == selection.chosen.terms:
             return named, judged
-        selection, judged, _ = gated_selection(search, assessor, named, terminal)
+        selection, judged, _ = gated_selection(search, assessor, named, terminal, use)
         if selection.chosen.terms == named.chosen.terms:
             return selection, judged
 
 
 def gated_selection(
-    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP
 ) -> tuple[Selection, list[Gate], list[int]]:
     """Judge on held-out episodes what every effect adds to the others; of those that fail one goes at a time.
 
@@ -79,6 +88,7 @@ def gated_selection(
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
     member of a set whether it helps: one of strong evidence that helps there on the whole stays where the set certainly does.
+    Where a use is named, harm is what is left of it with both models calibrated for that.
 
     Returns:
         what is left of the selection, its gates, and the terms with which an error grows.
@@ -88,7 +98,13 @@ def gated_selection(
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
         question = "judged", chosen.terms, *(trial.optimum.z.tobytes() for trial in (chosen, *parts))
-        judged = search.once(question, partial(gates, search, assessor, chosen, parts))
+        judged = [*search.once(question, partial(gates, search, assessor, chosen, parts))]
+        for i, (part, found) in enumerate(zip(parts, judged, strict=True)):
+            if found.harm and found.low > 0 and use != ONE_STEP and not search.budget.over("harm for the use"):
+                asked = "harm", use, chosen.terms, part.terms, chosen.optimum.z.tobytes(), part.optimum.z.tobytes()
+                grows = search.once(asked, partial(growing_for, search, assessor, chosen, part, use))
+                harmless = grows is not None and not grows
+                judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
         if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
             (whole,) = gates(search, assessor, chosen, [selection.base])
