@@ -226,7 +226,7 @@ def members_of(search: Search, trials: Sequence[Trial]) -> Members:
 
 def _verdict(search: Search, tied: Class, best: Design, file: str) -> dict[str, Any]:
     model = search.plan.augmented.model
-    start = {q.name: float(v) for q, v in zip(model.states, best.proposal.start, strict=True)}
+    start = {q.name: float(v) for q, v in _begins(search, best)}
     pairs = [
         {"true": tied.names[i], "against": tied.names[j], "expected_log_likelihood_ratio": float(best.ratio[i, j])}
         for i, j in tied.pairs
@@ -243,14 +243,17 @@ def _verdict(search: Search, tied: Class, best: Design, file: str) -> dict[str, 
     return found | {"description": _sentence(search, tied, best, file)}
 
 
+def _begins(search: Search, best: Design) -> list[tuple[Quantity, float]]:
+    """Return the states that an experimenter can set, with where they begin: not those that effects bring along."""
+    both = zip(search.plan.augmented.model.states, best.proposal.start, strict=True)
+    return [(q, float(v)) for q, v in both if q.role != HIDDEN]
+
+
 def _sentence(search: Search, tied: Class, best: Design, file: str) -> str:
     """Return what to do, for how long, and the expected gain in log evidence."""
     model = search.plan.augmented.model
     seconds = f"{len(best.inputs) * model.dt:.3g} s"
-    start = ", ".join(
-        f"{q.name} = {_short(v)} {q.unit}".removesuffix(" 1").rstrip()
-        for q, v in zip(model.states, best.proposal.start, strict=True)
-    )
+    start = ", ".join(f"{q.name} = {_short(v)} {q.unit}".removesuffix(" 1").rstrip() for q, v in _begins(search, best))
     spans = ", ".join(
         f"{q.name} within {_short(u.min())}..{_short(u.max())} {q.unit}".rstrip()
         for q, u in zip(model.inputs, best.inputs.T, strict=True)
