@@ -32,6 +32,7 @@ from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.verdict.aliases import are_aliases
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.runs.files import write_text
+from simulators.quantity import HIDDEN, Quantity
 
 FILE = "next_experiment.csv"
 LOUDER = (1.0, 1.5, 2.5, 5.0, 15.0, 100.0)  # factors on the process noise that a member may have
