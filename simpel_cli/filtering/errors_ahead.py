@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.filter import MOST_KEPT
+from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, no_jumps
 from simpel_cli.filtering.likelihood.track import Filter, Track
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
 from simpel_cli.filtering.setup import Setup
@@ -214,22 +215,22 @@ def _alone(
     p, noise = Coordinates.of(bounds, layout).physical(z)
     lead, seen = len(u) - len(y), min(first, len(y))
     track, _ = rule.track(p, noise, y[:seen], ok[:seen], u[: lead + seen], start, spread)
-    return _free(rule, p, rule.delayed_inputs(p, u), track.mean, start, seen)
+    return _free(rule, p, rule.delayed_inputs(p, u), track.mean, start, seen, y.shape[1])
 
 
-def _free(rule: Filter, p: Array, u_sub: Array, mean: Array, start: Array, first: int) -> Array:
+def _free(rule: Filter, p: Array, u_sub: Array, mean: Array, start: Array, first: int, ny: int) -> Array:
     """Return what is read along a simulation that begins with the filter's mean in the last of the first rows, (T, ny)."""
-    rows = len(u_sub)
+    rows, quiet = len(u_sub), no_jumps(ny, start)
     simulated = jnp.ones(len(start)).at[jnp.array(rule.remainders, int)].set(0.0)
 
-    def run(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], Array]:
-        before, x = carry
+    def run(carry: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        before, x, jumps = carry
         x = jnp.where(k < first, mean[jnp.minimum(k, first - 1)], x) * simulated
         last = jnp.maximum(k, 1) - 1
-        read = rule.read(p, before, u_sub[last], x, u_sub[jnp.minimum(last + 1, rows - 1)])
-        return (x, rule.flow(p, x, u_sub[k])), read
+        read, jumps = rule.read(p, before, u_sub[last], x, u_sub[jnp.minimum(last + 1, rows - 1)], jumps)
+        return (x, rule.flow(p, x, u_sub[k]), jumps), read
 
-    return jax.lax.scan(run, (start, start), jnp.arange(rows))[1]
+    return jax.lax.scan(run, (start, start, quiet), jnp.arange(rows))[1]
 
 
 def _window(
@@ -238,19 +239,28 @@ def _window(
 ) -> tuple[Track, Array, Array]:  # fmt: skip
     """Return the filter's track, what is read `horizon` rows ahead, and the free run."""
     p, noise = Coordinates.of(bounds, layout).physical(z)
-    track, _ = rule.track(p, noise, y, ok, u, start, spread)
+    track, held = rule.track(p, noise, y, ok, u, start, spread)
     u_sub = rule.delayed_inputs(p, u)
-    rows = y.shape[0]
+    rows, ny = y.shape
+    jumps = jnp.broadcast_to(no_jumps(ny, start), (rows, JUMPS, ny)) if held.jumps is None else held.jumps
 
-    def step(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], None]:
-        _, x = carry
-        return (x, rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)])), None
+    def step(carry: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], None]:
+        before, x, jumps = carry
+        u_before, u_now = (u_sub[jnp.clip(k - back, 0, rows - 1)] for back in (1, 0))
+        _, jumps = rule.read(p, before, u_before, x, u_now, jumps)
+        return (x, rule.flow(p, x, u_now), jumps), None
 
-    def from_row(x: Array, k: Array) -> Array:
-        before, end = jax.lax.scan(step, (x, x), k + jnp.arange(horizon))[0]
+    far = max(horizon - JUMPS, 0)  # what jumped so long before is shown no more
+
+    def on(x: Array, k: Array) -> tuple[Array, None]:
+        return rule.flow(p, x, u_sub[jnp.minimum(k, rows - 1)]), None
+
+    def from_row(x: Array, before: Array, k: Array) -> Array:
+        x = jax.lax.scan(on, x, k + jnp.arange(far))[0]
+        begun, end, jumps = jax.lax.scan(step, (x, x, before), k + jnp.arange(far, horizon))[0]
         last, now = (jnp.minimum(k + horizon - back, rows - 1) for back in (1, 0))
-        return rule.read(p, before, u_sub[last], end, u_sub[now])
+        return rule.read(p, begun, u_sub[last], end, u_sub[now], jumps)[0]
 
-    reached = jax.vmap(from_row)(track.mean, jnp.arange(rows))
+    reached = jax.vmap(from_row)(track.mean, jumps, jnp.arange(rows))
     ahead = jnp.concatenate([y[:horizon], reached])[:rows]
-    return track, ahead, _free(rule, p, u_sub, track.mean, start, min(first, rows))
+    return track, ahead, _free(rule, p, u_sub, track.mean, start, min(first, rows), ny)

@@ -24,7 +24,7 @@ from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward
 from simpel_cli.discovery.search.sets.forward import further, select
 from simpel_cli.discovery.search.sets.merging import merged
-from simpel_cli.discovery.search.sets.rivals import rivalled
+from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
 from simpel_cli.discovery.search.sets.selection import cut
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
@@ -515,9 +515,9 @@ def test_a_name_that_does_better_beside_what_came_later_takes_the_place_of_anoth
 ) -> None:
     monkeypatch.setattr(forward, "together", lambda *_: None)
     gains = {"": 0.0, "A": 30.0, "AB": 50.0, "B": 5.0, "C": 6.0}
-    assert Table(gains | {"BC": 50.1 + TIE}).chosen(beginnings=0) == "BC"
-    assert Table(gains | {"BC": 49.9 + TIE}).chosen(beginnings=0) == "AB"
-    assert Table(gains | {"BC": 60.0, "C": 58.0}).chosen(beginnings=0) == "C"  # beside which B earns nothing
+    assert Table(gains | {"BC": 50.1 + CERTAINLY}).chosen(beginnings=0) == "BC"
+    assert Table(gains | {"BC": 49.9 + CERTAINLY}).chosen(beginnings=0) == "AB"
+    assert Table(gains | {"BC": 66.0, "C": 62.0}).chosen(beginnings=0) == "C"  # beside which B earns nothing
 
 
 def test_a_path_that_stays_behind_the_best_one_goes_no_further() -> None:

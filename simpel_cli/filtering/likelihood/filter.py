@@ -264,14 +264,18 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def plain_measure(p: Array, x: Array, u: Array) -> Array:
         return sensors(x, u, p)[0]
 
-    def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array) -> Array:
+    def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array, jumps: Array) -> tuple[Array, Array]:
         end = u_before[-1, -1]
         now, slope = at_row(lambda u: sensors(x, u, p), end, u[0, 0], nu)
         pace, early = pace_of(end, nu), early_of(u[0, 0], nu)
-        if pace is None or early is None:
-            return now
-        begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
-        return now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
+        if pace is not None and early is not None:
+            begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
+            now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
+        if late_ones:
+            (d, tau), (rate, rate_x) = late_by(p), rates(x, end, p)
+            now = now + jnp.sum(slope * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
+            jumps = pushed(jumps, slope, rate, rates(x, u[0, 0], p)[0])
+        return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
     timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from simpel_cli.dynamics.late_readings import JUMPS, echo
 from simpel_cli.filtering.likelihood.small_matrices import product
 
-__all__ = ["back", "echo", "no_jumps", "pushed"]
+__all__ = ["JUMPS", "back", "echo", "no_jumps", "pushed"]
 
 
 def back(

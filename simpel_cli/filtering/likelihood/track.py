@@ -90,8 +90,9 @@ class Filter(NamedTuple):
             each: first in the directions of the noise that `louder` holds, then along the pushes.
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
-        read: (p, x of the row before, its u of the substeps, x, u of the substeps) -> what is read in a row, of which each
-            value may have been measured before it.
+        read: (p, x of the row before, its u of the substeps, x, u of the substeps, jumps) -> what is read in a row, of which
+            each value may have been measured before it, and the jumps of the rates before the next row, which late sensors
+            still show: (JUMPS, ny), 0 before the first row.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
             and end; what stands behind the inputs, behind them.
         remainders: rows of the state that are no part of a simulation (see `remainders.py`).
@@ -103,6 +104,6 @@ class Filter(NamedTuple):
     slopes: Callable[..., tuple[Float[Array, "D T ny"], Float[Array, "D T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
-    read: Callable[..., Float[Array, " ny"]]
+    read: Callable[..., tuple[Float[Array, " ny"], Float[Array, "K ny"]]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
     remainders: tuple[int, ...] = ()

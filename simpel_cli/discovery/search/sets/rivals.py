@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from simpel_cli.discovery.search.sets.selection import Selection, asked_for, nameless, weeded
-from simpel_cli.discovery.search.trials import ACCEPT, TIE, Search, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 
+CERTAINLY = 10.0  # nats by which a name has to do better than another to take its place: with less they are a class
 MOST = 0.9  # of what a function without a name explains: a formula that explains so much of it stays
 
 
@@ -27,7 +28,7 @@ def rivalled(search: Search, found: Selection) -> Selection:
             rivals = search.rivals(chosen, rest)
             classes.append(tuple(t for t in rivals if not nameless(search, t)))
             best = max(classes[-1], key=lambda t: t.optimum.log_evidence, default=chosen)
-            if best.optimum.log_evidence > (swapped or chosen).optimum.log_evidence + (0 if swapped else TIE):
+            if best.optimum.log_evidence > (swapped or chosen).optimum.log_evidence + (0 if swapped else CERTAINLY):
                 swapped = best
             beaten = next((t for t in rivals if nameless(search, t)), None)
             if instead is not None and chosen.terms[i] not in instead.terms:
