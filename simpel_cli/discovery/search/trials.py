@@ -12,6 +12,7 @@ import numpy as np
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread
 from simpel_cli.discovery.search.score_test import Score, promises
+from simpel_cli.discovery.search.two_optima import other_optima
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
@@ -194,6 +195,7 @@ class Search:
                 "with max(., 1e-9)."
             )
         best = self.best((), found)
+        best = self.best((), other_optima(self.plan, self.fitter, [best.optimum], -np.inf))
         return self._with_spreads(best) if self.own and self.plan.optimum is None else best
 
     def _with_spreads(self, base: Trial) -> Trial:
@@ -269,6 +271,9 @@ class Search:
             fits[t].append(optimum)
         trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
         left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
+        trials.sort(key=lambda t: -t.optimum.log_evidence)
+        other = other_optima(self.plan, self.fitter, [t.optimum for t in trials], before.optimum.log_evidence)
+        trials = [self.best(t.terms, [optimum]) for t, optimum in zip(trials, other, strict=True)]
         ordered = sorted(trials, key=lambda t: -t.optimum.log_evidence)
         return Stage(before, tuple(ordered), tuple((t, sd) for t, sd in left.items() if np.isfinite(sd)))
 
