@@ -262,7 +262,8 @@ def _with(
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
 
     def wider(search: Search, trial: Trial) -> Wider | None:
-        return too_narrow(search, trial) if ground.wider < MOST_WIDER else None
+        late = ground.wider == MOST_WIDER or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
+        return None if late else too_narrow(search, trial)
 
     def fitter(plan: Setup) -> Fitter:
         return fitter_of(plan, options.lanes, options.room + members(plan))
