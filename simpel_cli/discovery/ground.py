@@ -52,7 +52,7 @@ class Ground(NamedTuple):
 
         def with_memory(model: Model, *, extra: Sequence[Term] = (), **more: Any) -> Setup:
             given = {key_of(t) for t in extra}
-            return attached(model, extra=(*(t for t in self.remembering if key_of(t) not in given), *extra), **more)
+            return attached(model, extra=(*extra, *(t for t in self.remembering if key_of(t) not in given)), **more)
 
         return with_memory
 

@@ -35,7 +35,7 @@ from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import outlier_check, without_computed
 from simpel_cli.filtering.measurements.windows import Windows, thinned
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, members, setup, terms_of, whole_windows, with_memory
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, setup, terms_of, whole_windows, with_memory
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.declared import Declared
 from simpel_cli.studies.open import Study
@@ -128,7 +128,11 @@ def search_of(study: Study, terminal: Terminal) -> Searched:
         if isinstance(found, Wider):
             terminal.line(ranges_in_words(found), "ranges")
             model, effects = widened(ground.model, effects, found.ranges)
-            ground = ground._replace(model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier)
+            known = {key_of(t) for t in ground.remembering}  # in their ranges, too
+            terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
+            ground = ground._replace(
+                model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier, remembering=tuple(terms)
+            )
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)

@@ -227,7 +227,7 @@ def _free(rule: Filter, p: Array, u_sub: Array, mean: Array, start: Array, first
         before, x, jumps = carry
         x = jnp.where(k < first, mean[jnp.minimum(k, first - 1)], x) * simulated
         last = jnp.maximum(k, 1) - 1
-        read, jumps = rule.read(p, before, u_sub[last], x, u_sub[jnp.minimum(last + 1, rows - 1)], jumps)
+        read, jumps = rule.read(p, before, u_sub[last], x, u_sub[k], jumps)
         return (x, rule.flow(p, x, u_sub[k]), jumps), read
 
     return jax.lax.scan(run, (start, start, quiet), jnp.arange(rows))[1]

@@ -105,7 +105,7 @@ def setup(
     added = {key_of(t) for t in extra}
     terms = [t for t in every if key_of(t) not in added and (kept is None or key_of(t) in kept)]
     terms += extra
-    given, stores = model, stores_of(terms)
+    given, stores = model, tuple(sorted(stores_of(terms)))  # in an order that does not depend on which terms there are
     if stores:
         model, scales = with_stores(model, stores), _with_sizes(scales, stores)
     if simulated:

@@ -127,7 +127,8 @@ class Expression:
             raise ModelError(f"{where}.per: {self.per!r} is not the name of a column (letters, digits, underscores)")
         if self.per and self.operator:
             raise ModelError(f"{where}.per: a {self.operator} is the same for all groups; leave `per` out")
-        check_states(where, self.states, plain=bool(self.term) and not parts and not self.mutual and not self.passes)
+        plain = bool(self.term) and not (parts or self.mutual or self.passes or self.per)
+        check_states(where, self.states, self.parameters, plain=plain)
         for name, node in self.parameters.items():
             if not (
                 isinstance(node, Mapping) and isinstance(node.get("range"), list | tuple) and len(node["range"]) == 2

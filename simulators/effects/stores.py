@@ -16,12 +16,13 @@ from simulators.quantity import HIDDEN, ModelError
 KEYS = ("rate", "unit", "range", "begins")
 
 
-def check_states(where: str, states: Mapping[str, Any], *, plain: bool) -> None:
+def check_states(where: str, states: Mapping[str, Any], parameters: Mapping[str, Any], *, plain: bool) -> None:
     """Refuse states of an effect that are not declared as such.
 
     Args:
         where: key of the effect.
         states: as given.
+        parameters: of the effect, as given.
         plain: whether the effect has one term at one place.
 
     Raises:
@@ -29,7 +30,13 @@ def check_states(where: str, states: Mapping[str, Any], *, plain: bool) -> None:
     """
     if states and not plain:
         raise ModelError(
-            f"{where}.states: go with one `term` at one place; leave out `operator`, `mutual`, `passes`, parts"
+            f"{where}.states: go with one `term` at one place; leave out `operator`, `mutual`, `passes`, `per`, parts"
+        )
+    strengths = [k for k, node in parameters.items() if isinstance(node, Mapping) and not node.get("neutral", 0)]
+    if states and (len(states) != 1 or len(strengths) != 1):
+        raise ModelError(
+            f"{where}.states: {len(states)} states and {len(strengths)} parameters that are 0 where it is switched off "
+            f"({', '.join(strengths) or 'none'}); give one state and one strength, and every other parameter a `neutral` value"
         )
     for name, node in states.items():
         ends = node.get("range") if isinstance(node, Mapping) else None

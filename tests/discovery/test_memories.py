@@ -11,8 +11,10 @@ import yaml
 from command_line import TINY, simpel
 from scipy.integrate import solve_ivp
 
-from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
+from simpel_cli.data.recording import Episode
+from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, worth_a_search
 from simpel_cli.filtering.likelihood.augmented import augment
+from simpel_cli.filtering.measurements.windows import windows_of
 from simulators.effects import Expression, Scales
 from simulators.effects.stores import with_stores
 from simulators.model import Model, ModelError
@@ -135,6 +137,11 @@ def test_a_state_of_an_effect_does_what_its_equation_says() -> None:
             {"states": {"z": {"rate": "x", "range": [0, 1], "start": 0}}},
             r"states.z.start: no such key; allowed are rate",
         ),
+        ({"states": {n: {"rate": "x", "range": [0, 1]} for n in "zw"}}, r"wall.states: 2 states and 1 parameters"),
+        (
+            {"parameters": {"k": {"range": [0, 1]}, "tau": {"range": [1, 2]}}},
+            r"1 states and 2 parameters .* \(k, tau\)",
+        ),
         ({"term": "", "operator": "lag", "parameters": {"k": {"range": [0, 1]}}}, r"effect.wall.states: go with one"),
     ],
 )
@@ -149,3 +156,30 @@ def test_nothing_is_promised_where_no_effect_has_a_state() -> None:
 
     assert unwrap(worth_a_search)(nothing, nothing, []) is None
     assert Memory((), 12.4).words.endswith("promises +12: searching once more with it")
+
+
+def test_a_state_is_followed_without_inputs() -> None:
+    node = yaml.safe_load(HEATER) | {"inputs": {}, "dynamics": {"T": "a*(22 - T) + b"}}
+    from simulators.model import Declared
+
+    (term,) = wall().attach(Declared(**node).model(), Scales({"T": 50.0}, {"T": 0.5}, DT), ("T",))
+    augmented = augment(Declared(**node).model(), [term], ("T",))
+    p = augmented.neutral.copy()
+    place = augmented.rows(term)
+    p[place] = [1.0, 60.0]
+    course = _Course(augmented, term, p[None], place[0])
+    known = np.full((3, 40, 1), 30.0)
+    state = course.states(known, np.zeros((3, 40, 0)), np.full(3, 24.0), DT)
+    np.testing.assert_allclose(state[:, :, 0], 30 - 6 * np.exp(-DT * np.arange(40) / 60)[None].repeat(3, 0), rtol=1e-6)
+    np.testing.assert_allclose(course.at(course.slope, known, np.zeros((3, 40, 0)), state), state - 30.0)
+
+
+def test_columns_of_what_was_measured_are_found_beside_a_state_that_has_none() -> None:
+    """A sensor at its end, and values that count less, of an output: the model has a state more than the episode."""
+    end = np.array([[0, 0], [0, 0], [0, 1], [0, 0]])
+    weight = np.array([[1.0, 0.5]] * 4)
+    episode = Episode(
+        "e", np.arange(4.0), np.ones((4, 1)), np.zeros((4, 0)), 2 * np.ones((4, 1)), beyond=end, weight=weight
+    )
+    found = windows_of([episode], ["x", "z"], ("x", "y"), ("y",), np.zeros(2), np.ones(2), lead=0, dt=1.0)
+    np.testing.assert_array_equal(found.ok[0], [[1, 0.5], [1, 0.5], [1, 0], [1, 0.5]])

@@ -74,7 +74,12 @@ def accepted(
         named = rivalled(search, selection)
         if named.chosen.terms == selection.chosen.terms:
             return named, judged
-        selection, judged, _ = gated_selection(search, assessor, named, terminal, use)
+        after, gates_after, _ = gated_selection(search, assessor, named, terminal, use)
+        refused = {*named.chosen.terms} - {*selection.chosen.terms} - {*after.chosen.terms}
+        if refused:  # what would have taken the place of another: that was accepted, and stays
+            search.banned |= refused
+            continue
+        selection, judged = after, gates_after
         if selection.chosen.terms == named.chosen.terms:
             return selection, judged
 

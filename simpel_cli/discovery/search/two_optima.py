@@ -39,7 +39,7 @@ def other_optima(
         plan: of the search.
         fit: of hypotheses.
         found: best first.
-        least: evidence that a model has to have, nats.
+        least: evidence of what they are compared with, nats; -inf: of nothing.
     """
     n_p, n_r, _ = plan.coordinates.sizes
     ones = np.ones(len(plan.windows.episode))
@@ -47,7 +47,8 @@ def other_optima(
 
     def follows(o: Optimum) -> bool:
         low = bool(np.any(o.z[n_p : n_p + n_r] < FOLLOWS))
-        return low and bool(np.isfinite(o.loss)) and o.log_evidence - least > SHARE * most
+        much = not np.isfinite(least) or o.log_evidence - least > SHARE * most
+        return low and bool(np.isfinite(o.loss)) and much
 
     going = [i for i, o in enumerate(found) if follows(o)]
     new = list(found)

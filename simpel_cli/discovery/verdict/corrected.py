@@ -46,6 +46,7 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     name = sim["name"] + (added if terms else "_by_" + "_and_".join(sorted(by)) if by else "_in_wider_ranges")
     taken = {q.name for group in (model.states, model.inputs, model.params, model.outputs) for q in group}
     taken |= {*model.fixed, *(name for key in NAMES for name in sim.get(key) or {})}
+    taken |= {store.name for t in terms for store in t.stores}
     readings = {q.name for q in model.states if q.role == READING}
     # where sensors are declared, terms act on what these show
     plain = sim.get("_target_", DECLARED) == DECLARED and not sim.get("sensors")

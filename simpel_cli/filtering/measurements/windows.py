@@ -122,19 +122,22 @@ def windows_of(
         "clock": [],
     }
     for index, episode in enumerate(episodes):
+        own = list(states)[
+            : episode.states.shape[1]
+        ]  # what effects and remainders bring along stands last, without a column
         columns = [
-            episode.states[:, list(states).index(n)] if n in states else episode.outputs[:, list(outputs).index(n)]
+            episode.states[:, own.index(n)] if n in own else episode.outputs[:, list(outputs).index(n)]
             for n in measured
         ]
         y = np.stack(columns, axis=1)
         if episode.beyond is not None:  # an inequality is no measurement
-            every = [*states, *outputs]
+            every = [*own, *outputs]
             y = np.where(episode.beyond[:, [every.index(n) for n in measured]] != 0, np.nan, y)
         past = np.concatenate([np.repeat(episode.inputs[:1], lead, axis=0), episode.inputs])
-        clock = _clock(episode, states, measured, outputs, dt) if clocked else np.zeros((len(y), 0))
+        clock = _clock(episode, own, measured, outputs, dt) if clocked else np.zeros((len(y), 0))
         weight = np.ones(y.shape)
         if episode.weight is not None:
-            weight = episode.weight[:, [[*states, *outputs].index(name) for name in measured]]
+            weight = episode.weight[:, [[*own, *outputs].index(name) for name in measured]]
         for begin in range(0, len(y), length):
             part = y[begin : begin + length]
             if len(part) < LEAST:

@@ -127,7 +127,11 @@ def groupings(
         return []
     leaders = _leaders(search, selection) if unexplained or not chosen.terms else []
     terms = [search.terms[t] for t in (*chosen.terms, *(t.terms[-1] for t in leaders))]
-    alike = [e for e in effects if any(t.effect == e.name and not t.groupings for t in terms) and not e.operator]
+    alike = [
+        e
+        for e in effects
+        if any(t.effect == e.name and not t.groupings for t in terms) and not (e.operator or e.states)
+    ]
     if not alike:
         return []
     terminal.line(f"does {' or '.join(e.name for e in alike)} differ by {' or '.join(columns)}", "groups")
@@ -162,7 +166,7 @@ def _leaders(search: Search, selection: Selection) -> list[Trial]:
         alike = any(
             term.effect == t.effect or term.effect in t.generalises or t.effect in term.generalises for t in taken
         )
-        if not term.depends_on and not term.groupings and term.kind not in OPERATORS and not alike:
+        if not (term.depends_on or term.groupings or term.stores or term.kind in OPERATORS or alike):
             taken.append(term)
             found.append(trial)
     return found[:MOST_LEADERS]

@@ -187,7 +187,8 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
         if 1 < len(best.terms) < len(leader):
             there = leader[len(best.terms)]
             behind = behind + 1 if worth(best) < worth(there) else 0
-            if behind == MOST_BEHIND or set(best.terms) == set(there.terms):
+            alike = set(best.terms) == set(there.terms) and worth(best) <= worth(there) + ASTRAY
+            if behind == MOST_BEHIND or alike:
                 return _Grown(path, tuple(stages), None)
 
 

@@ -20,7 +20,7 @@ from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoisePr
 from simpel_cli.filtering.likelihood.augmented import Augmented, augment
 from simpel_cli.filtering.likelihood.sensitivity import shifts
 from simulators.effects import Term
-from simulators.effects.term import RATE
+from simulators.effects.term import RATE, SENSOR
 
 SIZES = (0.3, 0.1, 0.03, 0.01, 0.003)  # of the range of its strength
 MOST = 3  # that a program has room for
@@ -82,7 +82,7 @@ def _gain(levels: NoiseProfile, term: Term) -> float:
     rows = [r for r in plan.coordinates.driven if term.kind != RATE or names[r] == term.acts_on]
     here = [(row, level) for row in rows for level in levels(row)]
     strength = [i for i, k in enumerate(term.parameters) if k.neutral == 0]
-    if not here or len(strength) != 1 or len(term.stores) != 1:
+    if not here or len(strength) != 1 or len(term.stores) != 1 or term.kind not in (RATE, SENSOR):
         return -np.inf
     own = [levels.search.terms[t] for t in chosen.terms]
     augmented = augment(model, [*own, term], plan.augmented.measured)
@@ -97,11 +97,12 @@ def _gain(levels: NoiseProfile, term: Term) -> float:
         at[place[first]] = 1.0
         shapes.append(at)
     course = _Course(augmented, term, np.array(shapes), place[first])
-    span = term.parameters[first].high - term.parameters[first].low
+    low, high = term.parameters[first].low, term.parameters[first].high
+    ways = tuple(sign for sign, end in ((1.0, high), (-1.0, low)) if sign * end > 0)  # that its strength may have
     mean = np.asarray(here[0][1].track.mean)
     state = course.states(mean, here[0][1].inputs, _beginning(levels, term), model.dt)
     base = max(level.reached for _, level in here)
-    return max(_earned(level, course, state, row, span, model.dt) - base for row, level in here)
+    return max(_earned(level, course, state, row, (high - low, ways), model.dt) - base for row, level in here)
 
 
 def _beginning(levels: NoiseProfile, term: Term) -> np.ndarray:
@@ -151,7 +152,11 @@ class _Course:
     def at(self, program: casadi.Function, known: np.ndarray, inputs: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Return a program's value at known states (..., nx), inputs (..., nu) and the state (..., S)."""
         x = self._points(known, state)
-        u = np.broadcast_to(inputs[..., None, :], (*state.shape, inputs.shape[-1])).reshape(-1, inputs.shape[-1]).T
+        u = (
+            np.broadcast_to(inputs[..., None, :], (*state.shape, inputs.shape[-1]))
+            .reshape(state.size, inputs.shape[-1])
+            .T
+        )
         p = np.broadcast_to(self.shapes, (*state.shape, self.shapes.shape[1])).reshape(-1, self.shapes.shape[1]).T
         return np.nan_to_num(np.asarray(program(x, u, p)), posinf=0.0, neginf=0.0).reshape(state.shape)
 
@@ -179,7 +184,9 @@ class _Course:
         return np.stack(found, axis=1)
 
 
-def _earned(level: Level, course: _Course, state: np.ndarray, row: int, span: float, dt: float) -> float:
+def _earned(
+    level: Level, course: _Course, state: np.ndarray, row: int, strength: tuple[float, tuple[float, ...]], dt: float
+) -> float:
     """Return the log-likelihood that a model at one level of the noise reaches with the best shape and size."""
     mean, following = np.asarray(level.track.mean), np.roll(np.asarray(level.track.predicted), -1, axis=1)
     here = course.at(course.slope, mean, level.inputs, state)  # (W, T, S)
@@ -191,9 +198,12 @@ def _earned(level: Level, course: _Course, state: np.ndarray, row: int, span: fl
         reading = np.zeros((*ok.shape, here.shape[-1]))
         reading[:, :, course.channel] = here
         moved = shifts(level.track, ok, 0 * here, 0 * there, row, dt, reading)
+    span, ways = strength
     columns = span * moved * level.per_std[..., None]
     flat, known = columns.reshape(level.error.size, -1), level.known.reshape(level.error.size, -1)
     flat = flat - known @ (known.T @ flat)
     error = level.error.ravel()
-    gains = [evidence(f[None] @ f[:, None], np.array([f @ error]), np.array(SIZES)).max() for f in flat.T]
-    return level.reached + max(gains)
+    # what a term does to the innovations of a model that has it: this one lacks it, so its strength has the other sign
+    going = [f for f in flat.T if -np.sign(f @ error) in ways]
+    gains = [evidence(f[None] @ f[:, None], np.array([f @ error]), np.array(SIZES)).max() for f in going]
+    return level.reached + max(gains, default=-np.inf)
