@@ -1,6 +1,7 @@
 """Hidden states: what a chosen model leaves has a memory of a state that the simulator lacks."""
 
 import json
+from inspect import unwrap
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from simpel_cli.filtering.likelihood.augmented import augment
 from simpel_cli.filtering.measurements.windows import windows_of
 from simulators.effects import Expression, Scales
 from simulators.effects.stores import with_stores
-from simulators.model import Model, ModelError
+from simulators.model import Declared, Model, ModelError
 
 DT, AMBIENT = 2.0, 22.0
 HEATER = """name: heater
@@ -109,8 +110,6 @@ def wall(**more: Any) -> Expression:
 
 
 def heater() -> Model:
-    from simulators.model import Declared
-
     return Declared(**yaml.safe_load(HEATER)).model()
 
 
@@ -152,16 +151,12 @@ def test_states_that_are_declared_wrongly_are_named(more: dict[str, Any], said: 
 
 def test_nothing_is_promised_where_no_effect_has_a_state() -> None:
     nothing: Any = None
-    from inspect import unwrap
-
     assert unwrap(worth_a_search)(nothing, nothing, []) is None
     assert Memory((), 12.4).words.endswith("promises +12: searching once more with it")
 
 
 def test_a_state_is_followed_without_inputs() -> None:
     node = yaml.safe_load(HEATER) | {"inputs": {}, "dynamics": {"T": "a*(22 - T) + b"}}
-    from simulators.model import Declared
-
     (term,) = wall().attach(Declared(**node).model(), Scales({"T": 50.0}, {"T": 0.5}, DT), ("T",))
     augmented = augment(Declared(**node).model(), [term], ("T",))
     p = augmented.neutral.copy()

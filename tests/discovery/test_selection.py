@@ -23,7 +23,7 @@ from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward
 from simpel_cli.discovery.search.sets.forward import further, select
-from simpel_cli.discovery.search.sets.merging import merged
+from simpel_cli.discovery.search.sets.merging import _through, merged
 from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
 from simpel_cli.discovery.search.sets.selection import cut
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
@@ -465,6 +465,33 @@ def test_what_is_left_where_a_function_makes_an_effect_superfluous_is_judged_aga
     first: Any = both
     assert unwrap(accepted)(nothing, nothing, first, nothing)[0] is (none if refused else one)
     assert judged == [(1, 2), (1,)]
+
+
+def test_an_accepted_effect_stays_where_the_one_in_its_place_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new, none = (SimpleNamespace(chosen=SimpleNamespace(terms=terms)) for terms in ((1,), (2,), ()))
+
+    def gated(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[str], list[int]]:
+        return (none, [], [2]) if selection is new else (selection, ["judged"], [])
+
+    search: Any = SimpleNamespace(banned=set(), budget=Budget())
+    monkeypatch.setattr(acceptance, "gated_selection", gated)
+    monkeypatch.setattr(acceptance, "rivalled", lambda search, found: found if 2 in search.banned else new)
+    nothing: Any = None
+    first: Any = old
+    assert unwrap(accepted)(search, nothing, first, nothing) == (old, ["judged"])
+    assert search.banned == {2}
+
+
+def test_a_late_signal_stands_for_two_signals_on_their_channels_or_before_them() -> None:
+    terms = [SimpleNamespace(kind=kind, acts_on=place) for kind, place in (
+        ("delay", "u"), ("sensor_delay", "v"), ("sensor_lag", "s"), ("sensor_lag", "y"), ("rate", "v"))]  # fmt: skip
+    model = SimpleNamespace(inputs=(SimpleNamespace(name="u"),))
+    search: Any = SimpleNamespace(terms=terms, plan=SimpleNamespace(augmented=SimpleNamespace(model=model)))
+    through = unwrap(_through)
+    assert through(search, 0, (1, 2))  # an input that arrives late makes two sensors seem late
+    assert through(search, 1, (1, 2))
+    assert not through(search, 3, (1, 2))  # another sensor does not
+    assert not through(search, 0, (1, 4))  # and a force is no signal
 
 
 def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 from test_pairs import CUBIC, LINEAR, carts
 from test_ranges import cart, searched
 
-from simpel_cli.discovery.search.two_optima import other_optima, trusting
 from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.two_optima import other_optima, trusting
 
 
 def test_the_right_model_that_follows_a_sensor_finds_the_other_optimum() -> None:
@@ -30,3 +30,6 @@ def test_the_right_model_that_follows_a_sensor_finds_the_other_optimum() -> None
     start = trusting(search.plan, lost)
     assert np.all(start[n_p + n_r : n_p + n_r + n_q] <= 0.1)
     np.testing.assert_array_equal(start[n_p : n_p + n_r], search.plan.start[n_p : n_p + n_r])
+    # the simulator alone is compared with nothing, and begins again, too
+    (alone,) = other_optima(search.plan, search.fitter, [stuck], -np.inf)
+    assert alone.log_evidence == found.log_evidence

@@ -6,6 +6,8 @@ calibration is for that: so an effect that certainly earns its place on held-out
 more with both models calibrated for the use, on parts that had no part in that.
 """
 
+from functools import partial
+
 import numpy as np
 
 from simpel_cli.discovery.search.held_out_gate import AMPLE, Errors, errors_of, growing
@@ -47,12 +49,19 @@ def growing_for(
         return None
     both: list[Errors] = []
     for trial in (part, whole):
-        fitted: dict[int, Trial] = {}
         found: list[Errors] = []
         for seen, held in splits:
-            if id(seen) not in fitted:
-                fitted[id(seen)] = calibrated_for(search, assessor, trial, seen, use)
-            found.append(errors_of(assessor(fitted[id(seen)].optimum.z, held)))
+            # the model with all effects is compared with many that lack one
+            asked = (
+                "calibrated for",
+                use,
+                trial.terms,
+                trial.optimum.z.tobytes(),
+                seen.episode.tobytes(),
+                seen.begin.tobytes(),
+            )
+            fitted = search.once(asked, partial(calibrated_for, search, assessor, trial, seen, use))
+            found.append(errors_of(assessor(fitted.optimum.z, held)))
         both.append({words: np.concatenate([errors[words] for errors in found]) for words in found[0]})
     before, after = both
     return growing(before, after, search.plan.augmented.measured, np.concatenate(groups))
