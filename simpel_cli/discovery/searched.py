@@ -59,6 +59,7 @@ class Searched(NamedTuple):
         groupings: what it is worth that a parameter of the simulator, or an effect, differs from group to group.
         drift: a parameter that is no constant; None: there is none.
         wider: nats by which the evidence of the chosen model is ahead of that within the ranges that were declared.
+        again: a search that is worth making once what differs from group to group is known; None: there is none.
     """
 
     search: Search
@@ -73,6 +74,7 @@ class Searched(NamedTuple):
     groupings: list[Grouping]
     wider: float = 0.0
     drift: Drift | None = None
+    again: "Again | None" = None
 
 
 def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
@@ -112,10 +114,17 @@ def with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
 
 
 class Again(NamedTuple):
-    """Effects with a state of their own, with which a search is worth making again, beside what it chose or alone."""
+    """Effects with a state of their own, with which a search is worth making again.
+
+    Args:
+        memory: they.
+        earlier: what was chosen, beside which they promise; None: they do in its place.
+        effects: with those that differ from group to group; None: as they were given.
+    """
 
     memory: Memory
     earlier: Earlier | None
+    effects: list[Expression] | None = None
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
@@ -136,6 +145,7 @@ def search_of(study: Study, terminal: Terminal) -> Searched:
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
+            effects = found.effects or effects
         found = _search_in_groups(ground, effects)
     return _for_use(ground, found, declared, terminal)
 
@@ -182,26 +192,37 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
 
 
 def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Again:
-    """Search; once more with the effects that differ from group to group, as long as that pays."""
+    """Search; once more with the effects that differ from group to group, as long as that pays.
+
+    A state that nobody measures may stand for what differs from group to group, which is the simpler cause: it is asked last.
+    """
+    found, effects = _settled_in_groups(ground, effects)
+    if not isinstance(found, Searched) or found.again is None:
+        return found
+    return found.again._replace(effects=effects)
+
+
+def _settled_in_groups(ground: Ground, effects: list[Expression]) -> tuple[Searched | Wider | Again, list[Expression]]:
+    """Do so; also returns the effects as they were searched for in the end."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
         if not isinstance(found, Searched):
-            return found
+            return found, effects
         grouped = grouped_effects(effects, found.groupings)
         if grouped == effects:
             break
-        effects = grouped
+        ungrouped, effects = effects, grouped
         ground.terminal.line("searching once more with it", "groups")
         known = Earlier(found.search, found.selection.chosen)
         again = _search(ground._replace(earlier=known), effects, [g for g in found.groupings if g.parameter])
         if not isinstance(again, Searched):
-            return again
+            return again, effects
         if not any(again.search.terms[t].groupings for t in again.selection.chosen.terms):
-            return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen))
+            return found._replace(groupings=confirmed(found.groupings, found.search, found.selection.chosen)), ungrouped
         before = confirmed(found.groupings, again.search, again.selection.chosen)
         each = {(g.subject, g.per): g for g in (*before, *again.groupings)}
         found = again._replace(groupings=list(each.values()))
-    return found
+    return found, effects
 
 
 def _search(
@@ -335,9 +356,12 @@ def _with(
         selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     alone_levels = NoiseProfile(search, assessor, selection.base)
     alone = drifting(alone_levels) if selection.chosen.terms else None
+    again = None
     if (promising := remembering(levels, alone_levels)) is not None:
         memory, chosen_too = promising
-        return Again(memory, Earlier(search, selection.chosen) if chosen_too else None)
+        again = Again(memory, Earlier(search, selection.chosen) if chosen_too else None)
+        if not model.groups:
+            return again
     # what simulations have chosen need not be worth anything one row ahead
     if by_simulations is None and stands_for(alone, selection.base, selection.chosen):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
@@ -360,5 +384,5 @@ def _with(
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(
         search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
-        asked, drift=drift,
+        asked, drift=drift, again=again,
     )  # fmt: skip

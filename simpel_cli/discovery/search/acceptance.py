@@ -22,6 +22,7 @@ from simpel_cli.runs.console import Terminal
 STRONG = (
     20.0  # nats of evidence: an effect that earns so much may be uncertain on few held-out parts, if the set is not
 )
+CARRIED = 0.25  # of that evidence, which held-out parts have to bear out: together they are as many rows
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
 
@@ -129,7 +130,7 @@ def gated_selection(
 
 def _helps(judged: Gate, earned: float) -> bool:
     """Whether an effect that is not certain to help helps on the whole, with strong evidence and without harm."""
-    return not judged.harm and judged.gain > 0 and earned > STRONG
+    return not judged.harm and judged.gain > CARRIED * earned and earned > STRONG
 
 
 def with_interactions(

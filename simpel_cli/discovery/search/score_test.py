@@ -4,6 +4,11 @@ At the optimum of a model, switched-off parameters k have a gradient g and infor
 candidate gains about 1/2 g' S^-1 g, where S = F_kk - F_kb F_bb^-1 F_bk: the Schur complement lets the known parameters
 take what they can. Several candidates share one evaluation of the filter, since none of them is switched on.
 
+What has no size that could be switched off, a delay of some rows or a level at which a signal ends, is looked at where it
+begins, with the noise of the model without it: it promises what the loss falls by from that model to there, and twice what one
+Newton step in all unknowns promises from there, since such a term may lead further than a step tells. A start at which the
+model is so wrong that a step promises more than `FAR` cannot tell.
+
 Reference: Rao (1948), Large sample tests of statistical hypotheses; Cox and Hinkley (1974), Theoretical statistics, 9.3.
 """
 
@@ -22,14 +27,22 @@ class Score(NamedTuple):
 
     Args:
         gain: in log posterior, nats, with the known unknowns refitted; inf where a score cannot tell.
-        sd: of the first amplitude, in its range; inf likewise.
+        sd: of the first amplitude, in its range; inf likewise, and where there is none that could be switched off.
+        sure: nats that are not hoped for: `gain`, or, of what cannot be switched off, what is reached where it begins.
     """
 
     gain: float
     sd: float
+    sure: float
+
+    @property
+    def switched_off(self) -> bool:
+        """Whether it is told by the slope at a size of zero."""
+        return bool(np.isfinite(self.sd))
 
 
-UNTOLD = Score(np.inf, np.inf)
+UNTOLD = Score(np.inf, np.inf, -np.inf)
+FAR = 1000.0  # nats
 
 
 def promises(
@@ -66,7 +79,7 @@ def promises(
     group_of: dict[int, int] = {}
     for k, one in enumerate(sets):
         own = {starts[i][0]: i for i in one}
-        if not all(told[i] for i in one):
+        if not all(told[i] for i in one):  # several at once cannot tell
             continue
         for g, group in enumerate(groups):
             both = group | own
@@ -85,8 +98,24 @@ def promises(
             for row, parameter in zip(rows[term], terms[term].parameters, strict=True):
                 start[row] = plan.start[row] if parameter.neutral == 0 else starts[i][1].z[row]
         hypotheses.append(Hypothesis(start, known + tuple(r for term in group for r in rows[term]), ones))
+    # what cannot be switched off, by itself; the model without it comes first
+    begun = [
+        k for k, one in enumerate(sets)
+        if k not in group_of and len(one) == 1 and not terms[starts[one[0]][0]].groupings
+    ]  # fmt: skip
+    if begun:
+        hypotheses.append(Hypothesis(z, known, ones))
+    for k in begun:
+        term, hypothesis = starts[sets[k][0]]
+        start = z.copy()
+        start[list(rows[term])] = hypothesis.z[list(rows[term])]
+        hypotheses.append(Hypothesis(start, known + rows[term], ones))
     optima = fit(hypotheses, 1)
     found = [UNTOLD] * len(sets)
+    if begun:
+        without, *with_it = optima[len(groups) :]
+        for k, optimum in zip(begun, with_it, strict=True):
+            found[k] = _at_start(without, optimum)
     for k, g in group_of.items():
         optimum = optima[g]
         moved = [
@@ -97,6 +126,23 @@ def promises(
         ]
         found[k] = _promise(optimum.gradient, optimum.fisher, moved, len(known), optimum.z[list(optimum.free)])
     return found
+
+
+def _at_start(without: Optimum, optimum: Optimum) -> Score:
+    """Gain from a model to one with a term where it begins, and by a step from there."""
+    step, reached = _step(optimum) - _step(without), without.loss - optimum.loss
+    gain = reached + 2 * step
+    return Score(gain, np.inf, reached) if np.isfinite(gain) and step < FAR else UNTOLD
+
+
+def _step(at: Optimum) -> float:
+    """Return what one Newton step in all unknowns promises, those at a bound only inwards, nats."""
+    if not np.isfinite(at.fisher).all() or not np.isfinite(at.loss):
+        return np.inf
+    z, g = at.z[list(at.free)], at.gradient
+    inward = ~(((z <= 0) & (g >= 0)) | ((z >= 1) & (g <= 0)))
+    g, information = g[inward], at.fisher[np.ix_(inward, inward)] + LEAST_CURVATURE * np.eye(int(inward.sum()))
+    return float(0.5 * g @ np.linalg.solve(information, g))
 
 
 def _late(plan: Setup, term: int, row: int, hypothesis: Hypothesis) -> bool:
@@ -118,4 +164,5 @@ def _promise(gradient: np.ndarray, fisher: np.ndarray, rows: list[int], known: i
     sd = float(np.sqrt(np.linalg.inv(schur)[0, 0]))
     kept = [rows.index(r) for r in inward]
     g, schur = g[kept], schur[np.ix_(kept, kept)]
-    return Score(float(0.5 * g @ np.linalg.solve(schur, g)) if kept else 0.0, sd)
+    gain = float(0.5 * g @ np.linalg.solve(schur, g)) if kept else 0.0
+    return Score(gain, sd, gain)

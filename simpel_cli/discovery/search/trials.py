@@ -254,10 +254,10 @@ class Search:
         self.tried += len(candidates)
         starts = self.starts(before, candidates)
         scores = self.promises(before, starts)
-        promised = np.array([score.gain for score in scores])
+        promised, sure = np.array([(score.gain, score.sure) for score in scores]).reshape(-1, 2).T
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
         named = np.array([not self.terms[t].depends_on for t, _ in starts], bool)
-        finite = np.where(np.isfinite(promised), promised, 0.0)
+        finite = np.where(np.isfinite(sure), sure, 0.0)
         # functions without a name promise much where much is left: they keep no name from being fitted
         most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
@@ -341,7 +341,7 @@ class Search:
         promised = [
             (t, score.gain)
             for (t, _), score in zip(starts, self.promises(rest, starts), strict=True)
-            if np.isfinite(score.gain)
+            if score.switched_off
         ]
         earned = chosen.optimum.log_evidence - rest.optimum.log_evidence
         most = max((gain for t, gain in promised if t == own), default=earned)

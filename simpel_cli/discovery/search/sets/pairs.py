@@ -26,7 +26,7 @@ def together(search: Search, before: Trial) -> Trial | None:
     starts = search.starts(before, candidates)
     alone: dict[int, tuple[float, int]] = {}  # term -> what its best start promises, and where that stands
     for i, ((t, _), score) in enumerate(zip(starts, search.promises(before, starts), strict=True)):
-        if np.isfinite(score.gain) and score.gain >= alone.get(t, (0.0, i))[0]:
+        if score.switched_off and score.gain >= alone.get(t, (0.0, i))[0]:
             alone[t] = score.gain, i
     most = sorted(alone, key=lambda t: -alone[t][0])[:MOST]
     pairs = [pair for pair in combinations(most, 2) if search.fits((*before.terms, *pair))]
