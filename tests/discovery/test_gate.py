@@ -135,7 +135,7 @@ class Fits:
     def on(self, windows: Windows) -> "Fits":
         return Fits(self.noise, windows)
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
         return [optimum(self.fitted(hypothesis)) for hypothesis in hypotheses]
 
     def fitted(self, hypothesis: Hypothesis) -> np.ndarray:

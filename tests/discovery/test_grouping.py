@@ -20,7 +20,7 @@ from simulators.effects import Expression
 from simulators.model import Declared as Simulator
 
 
-def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]") -> dict[str, Any]:
+def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]", hidden: str = "") -> dict[str, Any]:
     """Balls whose drag the simulator lacks; the verdict of a search that nobody told of the groups but the data."""
     for group in ("sim", "data"):
         (folder / "my" / group).mkdir(parents=True)
@@ -36,7 +36,7 @@ def discovered(folder: Path, ball: str, *words: str, groups: str = "[ball]") -> 
     )  # fmt: skip
     assert made.code == 0, made.err
     found = simpel(
-        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", "effect=[quadratic_drag,input_backlash]",
+        folder, "discover", "--config-dir", "my", "sim=cart", "data=cart", f"effect=[quadratic_drag,input_backlash{hidden}]",
         "close=false", "report=false", "discovery.pairs=false", "hydra.run.dir=run", *words,
     )  # fmt: skip
     assert found.code == 0, found.err
@@ -52,7 +52,10 @@ def asked(verdict: dict[str, Any], effect: str = "", parameter: str = "") -> dic
 
 
 def test_that_balls_have_drags_of_their_own_is_found_without_being_asked(tmp_path: Path) -> None:
-    verdict = discovered(tmp_path, "{count: 6, parameters: {c: {law: lognormal, std: 0.5}}}")
+    # a state that nobody measures would explain as much, one drag for all balls beside it
+    verdict = discovered(
+        tmp_path, "{count: 6, parameters: {c: {law: lognormal, std: 0.5}}}", hidden=",hidden_exchange,hysteresis"
+    )
     one = asked(verdict, "quadratic_drag")
     assert (one["per"], one["pays"], one["gate"]["passed"], one["accepted"]) == ("ball", True, True, True)
     assert one["gain"] > 50

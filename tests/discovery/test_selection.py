@@ -44,7 +44,7 @@ class MadeUp:
     def __init__(self, row: int, neutral: float) -> None:
         self.row, self.neutral, self.far = row, neutral, 0
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             far = abs(hypothesis.z[self.row] - self.neutral) > 0.02
@@ -120,7 +120,7 @@ class Table:
             return self.evidence[names]
         return max(self.of(names - {name}) for name in names) - 1
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
             on = {i for i, rows in enumerate(self.search.rows) if set(rows) <= set(hypothesis.free)}
@@ -422,7 +422,7 @@ def test_a_base_that_had_not_found_its_place_is_left_for_a_better_one() -> None:
     still = pushed(lambda _, __, ___: 0.0, 0.0, 2).search
     good = still.base()
     z = np.where(np.arange(len(z)) == 0, 0.02, good.optimum.z)
-    lost = good.optimum._replace(z=z, log_evidence=good.optimum.log_evidence - 300)
+    lost = good.optimum._replace(z=z, log_evidence=good.optimum.log_evidence - 300, loss=good.optimum.loss + 300)
     still.known.clear()
     still.known[frozenset()] = lost
     none = select(still, Trial((), lost))

@@ -130,19 +130,9 @@ def promises(
 
 def _at_start(without: Optimum, optimum: Optimum) -> Score:
     """Gain from a model to one with a term where it begins, and by a step from there."""
-    step, reached = _step(optimum) - _step(without), without.loss - optimum.loss
+    step, reached = optimum.step - without.step, without.loss - optimum.loss
     gain = reached + 2 * step
     return Score(gain, np.inf, reached) if np.isfinite(gain) and step < FAR else UNTOLD
-
-
-def _step(at: Optimum) -> float:
-    """Return what one Newton step in all unknowns promises, those at a bound only inwards, nats."""
-    if not np.isfinite(at.fisher).all() or not np.isfinite(at.loss):
-        return np.inf
-    z, g = at.z[list(at.free)], at.gradient
-    inward = ~(((z <= 0) & (g >= 0)) | ((z >= 1) & (g <= 0)))
-    g, information = g[inward], at.fisher[np.ix_(inward, inward)] + LEAST_CURVATURE * np.eye(int(inward.sum()))
-    return float(0.5 * g @ np.linalg.solve(information, g))
 
 
 def _late(plan: Setup, term: int, row: int, hypothesis: Hypothesis) -> bool:

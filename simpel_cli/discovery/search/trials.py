@@ -11,6 +11,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread
+from simpel_cli.discovery.search.race import Race
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
@@ -26,6 +27,9 @@ PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
 SHARE = 0.3  # of the largest promise, likewise
 ALIKE = 0.8  # of what the term promises whose place a rival would take
 SHARE_OF_OWN = 0.4  # likewise
+NEARLY_THE_BEST = (
+    0.7  # of the gain of a stage's best: what is less goes no further, but where a search may begin with it
+)
 KEPT = 4  # starts of a stage that are fitted in any case
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
 NEARLY = 0.01  # of a parameter's range
@@ -263,8 +267,11 @@ class Search:
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
         begun = [*(starts[i] for i in going), *more]
         fits: dict[int, list[Optimum]] = {}
-        for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun]), strict=True):
-            fits.setdefault(t, []).append(optimum)
+        named = np.array([not self.terms[t].depends_on for t, _ in begun], bool)
+        race = Race(before.optimum.loss, NEARLY_THE_BEST if before.terms else SHARE, named)
+        for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun], hopes=race), strict=True):
+            if not optimum.left:
+                fits.setdefault(t, []).append(optimum)
         # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
         astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
         for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):

@@ -61,6 +61,7 @@ class Optimum(NamedTuple):
         covariance: (d, d) of the free unknowns about it, unit coordinates.
         iterations: taken.
         converged: whether the last steps no longer helped.
+        left: whether it was left on the way, where others were ahead.
     """
 
     z: np.ndarray
@@ -73,6 +74,20 @@ class Optimum(NamedTuple):
     covariance: np.ndarray
     iterations: int
     converged: bool
+    left: bool = False
+
+    @property
+    def step(self) -> float:
+        """What one Newton step promises from here, of unknowns at a bound only inwards, nats; inf where nothing is known."""
+        if not np.isfinite(self.fisher).all() or not np.isfinite(self.loss):
+            return np.inf
+        at, g = self.z[list(self.free)], self.gradient
+        inward = ~(((at <= 0) & (g >= 0)) | ((at >= 1) & (g <= 0)))
+        g, information = g[inward], self.fisher[np.ix_(inward, inward)] + LEAST_CURVATURE * np.eye(int(inward.sum()))
+        return float(0.5 * g @ np.linalg.solve(information, g))
+
+
+Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which of them are worth going on with
 
 
 class Course(NamedTuple):
@@ -109,12 +124,12 @@ class Fitter:
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
         self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST) -> list[Optimum]:
-        """Fit every hypothesis with `most` iterations."""
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST, hopes: Hopes | None = None) -> list[Optimum]:
+        """Fit every hypothesis with `most` iterations; after every round those go on of which `hopes` says so."""
         if not hypotheses:
             return []
         state = self._begin(hypotheses)
-        waiting = np.arange(len(hypotheses))
+        waiting, left = np.arange(len(hypotheses)), np.zeros(len(hypotheses), bool)
         while waiting.size:
             before = state.loss[waiting]
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
@@ -128,6 +143,13 @@ class Fitter:
             # a step that helped with the damping of a refusal is short, whatever is left to gain
             crawls = (gained < SLOW) & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
             waiting = waiting[~state.done[waiting] & ~crawls & (state.iteration[waiting] < most)]
+            if hopes is not None and waiting.size:
+                hopeful = hopes(self._optima(state, hypotheses))
+                left[waiting] = [not hopeful[i] for i in waiting]
+                waiting = waiting[~left[waiting]]
+        return [o._replace(left=bool(gone)) for o, gone in zip(self._optima(state, hypotheses), left, strict=True)]
+
+    def _optima(self, state: Course, hypotheses: Sequence[Hypothesis]) -> list[Optimum]:
         return [self._optimum(state, i, hypothesis.free) for i, hypothesis in enumerate(hypotheses)]
 
     def on(self, windows: Windows) -> "Fitter":

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
-from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hopes, Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.priors.spreads import LEAST, factor_of, sd_of_log
 
@@ -56,12 +56,15 @@ class Spreading:
         self.fitter, self.spreads = fitter, spreads
         self.width, self.coordinates = fitter.width, fitter.coordinates
 
-    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST) -> list[Optimum]:
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = MOST, hopes: Hopes | None = None) -> list[Optimum]:
         """Fit every hypothesis; one that leaves windows out, or of a single iteration, keeps its spreads."""
-        found = self.fitter(hypotheses, most)
+        found = self.fitter(hypotheses, most, hopes)
         if most < MOST:
             return found
-        moving = [i for i, h in enumerate(hypotheses) if np.all(h.weight == 1) and self._here(found[i])]
+        moving = [
+            i for i, h in enumerate(hypotheses)
+            if np.all(h.weight == 1) and self._here(found[i]) and not found[i].left
+        ]  # fmt: skip
         best = {i: self._paid(found[i]) for i in moving}
         for _ in range(ROUNDS):
             again = {}
