@@ -7,10 +7,12 @@ once more from there.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.race import hopeful
 from simpel_cli.filtering.setup import Setup
 
 FIRST = 3  # models of a stage that are fitted once more; the others where it pays for one of these
@@ -31,13 +33,13 @@ def trusting(plan: Setup, z: np.ndarray) -> np.ndarray:
 
 
 def other_optima(
-    plan: Setup, fit: Callable[[list[Hypothesis]], list[Optimum]], found: Sequence[Optimum], least: float
+    plan: Setup, fit: Callable[..., list[Optimum]], found: Sequence[Optimum], least: float
 ) -> list[Optimum]:
     """Return models of one stage, of which those that follow a sensor were fitted once more; the better fit of each.
 
     Args:
         plan: of the search.
-        fit: of hypotheses.
+        fit: of hypotheses, as a `Fitter`.
         found: best first.
         least: evidence of what they are compared with, nats; -inf: of nothing.
     """
@@ -53,10 +55,17 @@ def other_optima(
     going = [i for i, o in enumerate(found) if follows(o)]
     new = list(found)
     for part in (going[:FIRST], going[FIRST:]):
-        fits = fit([Hypothesis(trusting(plan, found[i].z), found[i].free, ones) for i in part])
+        losses = [found[i].loss for i in part]
+        fits = fit(
+            [Hypothesis(trusting(plan, found[i].z), found[i].free, ones) for i in part], hopes=partial(_ahead, losses)
+        )
         better = [(i, o) for i, o in zip(part, fits, strict=True) if o.log_evidence > found[i].log_evidence + BETTER]
         for i, o in better:
             new[i] = o
         if not better:
             break
     return new
+
+
+def _ahead(losses: Sequence[float], optima: Sequence[Optimum]) -> list[bool]:
+    return hopeful(optima, losses)

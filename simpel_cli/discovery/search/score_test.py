@@ -69,12 +69,7 @@ def promises(
     terms = plan.augmented.terms
     rows = {term: tuple(plan.augmented.rows(terms[term])) for term, _ in starts}
     room = width - len(known)
-    told = [
-        not terms[term].groupings
-        and any(k.neutral == 0 for k in terms[term].parameters)
-        and not _late(plan, term, rows[term][0], hypothesis)
-        for term, hypothesis in starts
-    ]
+    told = [has_size(plan, term, hypothesis) for term, hypothesis in starts]
     groups: list[dict[int, int]] = []  # term -> its start
     group_of: dict[int, int] = {}
     for k, one in enumerate(sets):
@@ -130,15 +125,18 @@ def promises(
 
 def _at_start(without: Optimum, optimum: Optimum) -> Score:
     """Gain from a model to one with a term where it begins, and by a step from there."""
-    step, reached = optimum.step - without.step, without.loss - optimum.loss
-    gain = reached + 2 * step
-    return Score(gain, np.inf, reached) if np.isfinite(gain) and step < FAR else UNTOLD
+    if not max(optimum.step, without.step) < FAR:
+        return UNTOLD
+    reached = without.loss - optimum.loss
+    return Score(reached + 2 * (optimum.step - without.step), np.inf, reached)
 
 
-def _late(plan: Setup, term: int, row: int, hypothesis: Hypothesis) -> bool:
-    """Whether a term begins as a delay of more than a row: a slope at none tells nothing of that."""
-    late = plan.coordinates.value(row, hypothesis.z[row]) > plan.augmented.model.dt
-    return plan.augmented.terms[term].kind == DELAY and late
+def has_size(plan: Setup, place: int, start: Hypothesis) -> bool:
+    """Whether a term has a size, where it begins, that can be switched off; of a delay of rows no slope at none tells."""
+    term = plan.augmented.terms[place]
+    row = plan.augmented.rows(term)[0]
+    late = term.kind == DELAY and plan.coordinates.value(row, start.z[row]) > plan.augmented.model.dt
+    return not term.groupings and any(k.neutral == 0 for k in term.parameters) and not late
 
 
 def _promise(gradient: np.ndarray, fisher: np.ndarray, rows: list[int], known: int, at: np.ndarray) -> Score:

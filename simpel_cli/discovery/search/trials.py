@@ -11,10 +11,10 @@ import numpy as np
 
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread
-from simpel_cli.discovery.search.race import Race
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.race import Race
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.filtering.two_optima import other_optima
 from simulators.groups import SPREAD, slot_names, spreads_of

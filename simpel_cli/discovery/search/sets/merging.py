@@ -4,6 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
+from simpel_cli.discovery.search.score_test import has_size
 from simpel_cli.discovery.search.sets.selection import nameless, worth
 from simpel_cli.discovery.search.trials import ACCEPT, SHARE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
@@ -71,7 +72,9 @@ def _alike(search: Search, chosen: Trial, pair: tuple[int, int]) -> list[int]:
     off = rest._replace(optimum=chosen.optimum._replace(z=search.off(chosen.optimum.z, pair)))
     candidates = [t for t in search.candidates(rest.terms) if t not in pair]
     own = [(t, Hypothesis(chosen.optimum.z, search.free(chosen.terms), search.ones)) for t in pair]
-    starts = [*own, *search.starts(off, candidates)]
+    sized = [s for s in search.starts(off, candidates) if has_size(search.plan, *s)]
+    late = [t for t in candidates if _through(search, t, pair)]
+    starts = [*own, *sized, *(s for s in search.starts(off, late) if not has_size(search.plan, *s))]
     sets = [(0, 1), *((i,) for i in range(2, len(starts)))]
     both, *each = search.promises(off, starts, sets)
     if np.isfinite(both.gain):
@@ -81,7 +84,7 @@ def _alike(search: Search, chosen: Trial, pair: tuple[int, int]) -> list[int]:
         least = SHARE * max(chosen.optimum.log_evidence - part.optimum.log_evidence for part in parts)
     return list(dict.fromkeys(
         t for (t, _), score in zip(starts[2:], each, strict=True)
-        if (score.gain > least if np.isfinite(score.gain) else _through(search, t, pair))
+        if score.gain > least  # also where that cannot be told
     ))  # fmt: skip
 
 

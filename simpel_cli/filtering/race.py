@@ -1,0 +1,41 @@
+"""Fits race: one that can no longer come as far as it has to is left where it is.
+
+A stage of a search fits many effects, each from several starts, and goes on with one. After a few iterations it shows which
+have no chance: what a fit has reached so far, and a few times what a Newton step promises from there, is not enough.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simpel_cli.filtering.likelihood.fit import Optimum
+
+HOPED = 4.0  # times what a Newton step promises: as much as fits have gained beyond it
+MARGIN = 10.0  # nats
+
+
+def hopeful(optima: Sequence[Optimum], losses: Sequence[float]) -> list[bool]:
+    """Return which fits may come to so small a loss."""
+    return [not o.loss - HOPED * o.step > loss + MARGIN for o, loss in zip(optima, losses, strict=True)]
+
+
+@dataclass(frozen=True)
+class Race:
+    """Which fits of a stage go on.
+
+    Args:
+        loss: of the model before, nats.
+        share: of what the best fit has gained, which the others have to be able to gain.
+        counts: (L,) bool, which fits the others are compared with.
+    """
+
+    loss: float
+    share: float
+    counts: np.ndarray
+
+    def __call__(self, optima: Sequence[Optimum]) -> list[bool]:
+        """Return which go on."""
+        gains = np.array([self.loss - o.loss for o in optima])
+        best = gains[np.asarray(self.counts) & np.isfinite(gains)].max(initial=0.0)
+        return hopeful(optima, [self.loss - self.share * float(best)] * len(optima))
