@@ -8,13 +8,11 @@ from simpel_cli.discovery.search.score_test import has_size
 from simpel_cli.discovery.search.sets.selection import nameless, worth
 from simpel_cli.discovery.search.trials import ACCEPT, SHARE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.race import hopeful
 from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
-MOST_AGAIN = 3
-NEARLY_ALL = 0.7  # of what two effects explain: a fit that came to less in their place need not be made again
-MOST_OF_IT = (
-    0.4  # likewise, of what a term in their place explains to first order, with a shape that is still to be found
-)
+SLACK = 10.0  # nats by which the widths of priors may differ
+MOST_OF_IT = 0.4  # of what two effects explain, to first order: a term in their place may have to find its shape
 SIGNALS = (*OPERATORS, SENSOR, INPUT)
 
 
@@ -32,26 +30,28 @@ def merged(search: Search, chosen: Trial) -> Stage | None:
 
 
 def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stage | None:
+    alike = {pair: own for pair in pairs if (own := _alike(search, chosen, pair))}
+    # from the chosen model and its noise: those go on that may come as far as an effect less has to
+    begun = [
+        ((*(t for t in chosen.terms if t not in pair), new), hypothesis)
+        for pair, own in alike.items()
+        for new in own
+        for hypothesis in _in_place_of(search, chosen, pair, new)
+    ]
+    needed = chosen.optimum.loss + asked(len(chosen.terms)) + SLACK
+    fits = search.fitter(
+        [hypothesis for _, hypothesis in begun], hopes=lambda optima: hopeful(optima, [needed] * len(optima))
+    )
+    reached = dict.fromkeys(terms for (terms, _), fit in zip(begun, fits, strict=True) if not fit.left)
+    for (terms, _), fit in zip(begun, fits, strict=True):
+        if not fit.left:
+            search.best(terms, [fit])
     most, found = worth(chosen), None
-    alike = [_alike(search, chosen, pair) for pair in pairs]
-    pairs, alike = [p for p, own in zip(pairs, alike, strict=True) if own], [own for own in alike if own]
-    sets = [tuple(t for t in chosen.terms if t not in pair) for pair in pairs]
-    fits = search.fitter([hypothesis for less in sets for hypothesis in search.less(chosen, less)])
-    for k, less in enumerate(sets):
-        rest = search.best(less, fits[2 * k : 2 * k + 2])
-        promising = _in_place_of(search, chosen, alike[k], rest)
-        if not promising:
-            continue
-        stage = search.add(rest, promising)
-        # with two terms less the noise may have settled elsewhere: the best begin once more with that of the chosen model
-        z = search.off(chosen.optimum.z, pairs[k])
-        again = [t for t in stage.trials if not nameless(search, t)][:MOST_AGAIN]
-        hypotheses = [(t.terms, hypothesis) for t in again for hypothesis in search.hypotheses(t.terms, t.terms[-1], z)]
-        for (terms, _), optimum in zip(
-            hypotheses, search.fitter([hypothesis for _, hypothesis in hypotheses]), strict=True
-        ):
-            search.best(terms, [optimum])
-        trials = sorted((search.best(t.terms, ()) for t in stage.trials), key=lambda t: -t.optimum.log_evidence)
+    for less in dict.fromkeys(terms[:-1] for terms in reached):
+        rest = search.part(chosen, less)
+        stage = search.add(rest, [terms[-1] for terms in reached if terms[:-1] == less])
+        known = {t.terms for t in stage.trials} | {terms for terms in reached if terms[:-1] == less}
+        trials = sorted((search.best(terms, ()) for terms in known), key=lambda t: -t.optimum.log_evidence)
         stage, named = stage._replace(trials=tuple(trials)), search.best_named(trials)
         for trial in [*([named] if named else []), *(t for t in trials[:1] if nameless(search, t))]:
             value = worth(trial) - (ACCEPT if nameless(search, trial) else 0.0)
@@ -59,6 +59,12 @@ def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stag
                 others = [t for t in stage.trials if t is not trial]
                 most, found = value, stage._replace(trials=(trial, *others))
     return found
+
+
+def _in_place_of(search: Search, chosen: Trial, pair: tuple[int, int], new: int) -> list[Hypothesis]:
+    """Return starts at a chosen model with one effect in place of two."""
+    terms = (*(t for t in chosen.terms if t not in pair), new)
+    return search.hypotheses(terms, new, search.off(chosen.optimum.z, pair))
 
 
 def _alike(search: Search, chosen: Trial, pair: tuple[int, int]) -> list[int]:
@@ -96,21 +102,3 @@ def _through(search: Search, term: int, pair: tuple[int, int]) -> bool:
     ends = {other.acts_on for other in others}
     inputs = {q.name for q in search.plan.augmented.model.inputs}
     return new.acts_on in ends | inputs or ends <= inputs
-
-
-def _in_place_of(search: Search, chosen: Trial, candidates: list[int], rest: Trial) -> list[int]:
-    """Return the terms that may do as well as a pair of effects: they promise a share of what is needed beside the rest.
-
-    What was fitted beside the rest already, and came to much less, is left.
-    """
-    whole = chosen.optimum.log_evidence - asked(len(chosen.terms)) - rest.optimum.log_evidence
-
-    def fell_short(term: int) -> bool:
-        known = search.known.get(frozenset((*rest.terms, term)))
-        return known is not None and known.log_evidence - rest.optimum.log_evidence < NEARLY_ALL * whole
-
-    starts = search.starts(rest, [t for t in candidates if not fell_short(t)])
-    scores = search.promises(rest, starts)
-    return list(dict.fromkeys(
-        t for (t, _), score in zip(starts, scores, strict=True) if score.gain > SHARE * whole
-    ))  # fmt: skip
