@@ -9,15 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simpel_cli.filtering.likelihood.fit import Optimum
+from simpel_cli.filtering.likelihood.fit import ROUND, Optimum
 
 HOPED = 4.0  # times what a Newton step promises: as much as fits have gained beyond it
+PATIENCE = 2 * ROUND  # iterations before that holds: from a start that is far off a step tells less
+AT_FIRST = 10.0  # times, before
 MARGIN = 10.0  # nats
 
 
 def hopeful(optima: Sequence[Optimum], losses: Sequence[float]) -> list[bool]:
     """Return which fits may come to so small a loss."""
-    return [not o.loss - HOPED * o.step > loss + MARGIN for o, loss in zip(optima, losses, strict=True)]
+    hoped = [HOPED if o.iterations >= PATIENCE else AT_FIRST for o in optima]
+    return [not o.loss - h * o.step > loss + MARGIN for o, h, loss in zip(optima, hoped, losses, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,9 @@ class Race:
     counts: np.ndarray
 
     def __call__(self, optima: Sequence[Optimum]) -> list[bool]:
-        """Return which go on."""
+        """Return which go on, that with the least loss in any case."""
         gains = np.array([self.loss - o.loss for o in optima])
         best = gains[np.asarray(self.counts) & np.isfinite(gains)].max(initial=0.0)
-        return hopeful(optima, [self.loss - self.share * float(best)] * len(optima))
+        going = hopeful(optima, [self.loss - self.share * float(best)] * len(optima))
+        going[int(np.argmax(gains))] = True
+        return going

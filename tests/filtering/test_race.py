@@ -8,17 +8,17 @@ from linear_plant import LOAD, model, recording
 
 from simpel_cli.filtering.likelihood import fit
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, MOST, ROUND, Course, Fitter, Hypothesis, Optimum
-from simpel_cli.filtering.race import HOPED, MARGIN, Race, hopeful
+from simpel_cli.filtering.race import HOPED, MARGIN, PATIENCE, Race, hopeful
 from simpel_cli.filtering.setup import setup
 
 CURVED = 100.0
 
 
-def standing(loss: float, slope: float = 0.0, at: float = 0.5) -> Optimum:
+def standing(loss: float, slope: float = 0.0, at: float = 0.5, iterations: int = PATIENCE) -> Optimum:
     """A fit of one unknown, with the slope of its loss there."""
     eye = np.eye(1)
     z = np.array([at])
-    return Optimum(z, (0,), loss, -loss, np.array([slope]), CURVED * eye, z, eye, 4, False)
+    return Optimum(z, (0,), loss, -loss, np.array([slope]), CURVED * eye, z, eye, iterations, False)
 
 
 @pytest.mark.parametrize(("at", "slope", "moves"), [(0.5, 30.0, True), (0.0, -30.0, True), (0.0, 30.0, False)])
@@ -35,6 +35,8 @@ def test_what_cannot_come_as_far_is_left() -> None:
     losses = [needed + MARGIN + HOPED * step + d for d in (-0.1, 0.1)]
     assert hopeful([standing(loss, 30.0) for loss in losses], [needed] * 2) == [True, False]
     assert hopeful([standing(np.inf)], [needed]) == [True]  # nothing is known of it yet
+    early = [standing(loss, 30.0, iterations=PATIENCE - 1) for loss in losses]
+    assert hopeful(early, [needed] * 2) == [True, True]  # so early a step tells less
 
 
 def test_fits_are_compared_with_a_share_of_the_best_that_counts() -> None:
@@ -42,6 +44,8 @@ def test_fits_are_compared_with_a_share_of_the_best_that_counts() -> None:
     optima = [standing(best), standing(before - 100.0), standing(before - 20.0), standing(100.0)]
     assert Race(before, 0.5, np.array([True, True, True, False]))(optima) == [True, True, False, True]
     assert Race(before, 0.5, np.zeros(4, bool))(optima) == [True] * 4  # none that counts has gained
+    worse = [standing(before + 100.0), standing(before + 50.0)]
+    assert Race(before, 0.5, np.ones(2, bool))(worse) == [False, True]  # the best of them in any case
 
 
 def test_a_fit_that_is_left_stops_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
