@@ -7,6 +7,8 @@ Constants of a module that a test replaces are no part of that: such a test swit
 """
 
 import contextlib
+import ctypes
+import gc
 import hashlib
 import os
 import threading
@@ -55,6 +57,7 @@ class Program:
                     found = self._found(arguments, shape)
                     found(*arguments)
                     self._by_shape[shape] = found
+                    _returned()
         return found(*arguments)
 
     def _found(self, arguments: Any, shape: Any) -> Callable[..., Any]:
@@ -83,6 +86,13 @@ class Program:
             with contextlib.suppress(OSError):  # no room, or a folder that may only be read
                 _write(file, data)
         return jax.jit(exported.call)
+
+
+def _returned() -> None:
+    """Return to the machine what making a program took and has freed, which the C library else keeps: hundreds of MB."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # only glibc has it
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @cache
