@@ -11,9 +11,13 @@ from command_line import simpel
 from test_effects_by_group import CART, DATA
 
 from simpel_cli.data import Measurements
+from simpel_cli.discovery import searched as whole
+from simpel_cli.discovery.ground import Ground
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, sentence_of
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained.memories import Memory
+from simpel_cli.discovery.searched import Again, Searched
 from simpel_cli.errors import ConfigError
 from simpel_cli.studies.declared import Declared
 from simulators.effects import Expression
@@ -70,6 +74,35 @@ def test_that_balls_have_drags_of_their_own_is_found_without_being_asked(tmp_pat
     assert verdict["error"]["after"]["horizon"]["v"] < 0.012  # 0.162 with one
     (file,) = (tmp_path / "run/conf/sim").glob("*.yaml")
     assert yaml.safe_load(file.read_text())["parameters"]["c"]["per"] == "ball"
+
+
+@pytest.mark.parametrize("pays", [True, False])
+def test_a_state_that_nobody_measures_is_asked_when_groups_are_known(
+    pays: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where drags of their own explain it, no search is made with such a state; else one with the effects as they were."""
+    nothing: Any = None
+    drag = Expression("drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 1], "unit": "1/s"}})
+    memory = Again(Memory((), 20.0), None)
+    one = Grouping("drag", "ball", 50.0, None, pays=True, accepted=True)
+    (term,) = (SimpleNamespace(groupings=("ball",)),)
+    search: Any = SimpleNamespace(terms=[term])
+    selection: Any = SimpleNamespace(chosen=SimpleNamespace(terms=(0,)))
+    first = Searched(
+        search, nothing, selection, [], None, nothing, nothing, {}, {}, [one] if pays else [], again=memory
+    )
+    answers = iter([first, first._replace(groupings=[], again=None)])
+    monkeypatch.setattr(whole, "_search", lambda *_: next(answers))
+    monkeypatch.setattr(whole, "confirmed", lambda groupings, *_: groupings)
+    terminal: Any = SimpleNamespace(line=lambda *_: None)
+    ground = Ground(nothing, nothing, nothing, (), terminal, nothing)
+    found = whole._search_in_groups(ground, [drag])
+    if pays:
+        assert isinstance(found, Searched)
+        assert found.again is None
+    else:
+        assert isinstance(found, Again)
+        assert found.effects == [drag]
 
 
 def test_that_balls_are_alike_is_said(tmp_path: Path) -> None:

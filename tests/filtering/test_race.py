@@ -29,6 +29,14 @@ def test_a_newton_step_promises_what_a_parabola_falls_by(at: float, slope: float
     assert standing(np.inf).step == np.inf
 
 
+def test_a_step_is_known_where_a_curvature_is_beyond_rounding() -> None:
+    """From a start that is far off one curvature hides the others: no matrix of them can be inverted."""
+    big = 1e32 * np.array([[1.0, 1.0], [1.0, 1.0]])
+    z = np.full(2, 0.5)
+    far = Optimum(z, (0, 1), 10.0, -10.0, np.array([1.0, 1.0]), big, z, np.eye(2), 1, False)
+    assert 0.0 <= far.step < 1.0
+
+
 def test_what_cannot_come_as_far_is_left() -> None:
     step = standing(0.0, 30.0).step
     needed = 100.0

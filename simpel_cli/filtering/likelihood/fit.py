@@ -83,8 +83,12 @@ class Optimum(NamedTuple):
             return np.inf
         at, g = self.z[list(self.free)], self.gradient
         inward = ~(((at <= 0) & (g >= 0)) | ((at >= 1) & (g <= 0)))
-        g, information = g[inward], self.fisher[np.ix_(inward, inward)] + LEAST_CURVATURE * np.eye(int(inward.sum()))
-        return float(0.5 * g @ np.linalg.solve(information, g))
+        try:
+            values, axes = np.linalg.eigh(self.fisher[np.ix_(inward, inward)])
+        except np.linalg.LinAlgError:  # from a start that is far off curvatures differ by more than numbers can tell
+            return np.inf
+        # with the prior's; rounding beside a very large curvature may have made others negative
+        return float(0.5 * np.sum((axes.T @ g[inward]) ** 2 / (np.maximum(values, 0.0) + LEAST_CURVATURE)))
 
 
 Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which of them are worth going on with
