@@ -197,7 +197,11 @@ def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | W
     A state that nobody measures may stand for what differs from group to group, which is the simpler cause: it is asked last.
     """
     found, effects = _settled_in_groups(ground, effects)
+    if isinstance(found, Again):
+        return found._replace(effects=effects)
     if not isinstance(found, Searched) or found.again is None:
+        return found
+    if ground.budget.over("effects with a state of their own"):
         return found
     return found.again._replace(effects=effects)
 

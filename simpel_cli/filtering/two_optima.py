@@ -59,7 +59,8 @@ def other_optima(
         fits = fit(
             [Hypothesis(trusting(plan, found[i].z), found[i].free, ones) for i in part], hopes=partial(_ahead, losses)
         )
-        better = [(i, o) for i, o in zip(part, fits, strict=True) if o.log_evidence > found[i].log_evidence + BETTER]
+        fits_of = [(i, o) for i, o in zip(part, fits, strict=True) if not o.left]
+        better = [(i, o) for i, o in fits_of if o.log_evidence > found[i].log_evidence + BETTER]
         for i, o in better:
             new[i] = o
         if not better:

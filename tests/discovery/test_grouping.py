@@ -13,6 +13,7 @@ from test_effects_by_group import CART, DATA
 from simpel_cli.data import Measurements
 from simpel_cli.discovery import searched as whole
 from simpel_cli.discovery.ground import Ground
+from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, sentence_of
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -95,7 +96,7 @@ def test_a_state_that_nobody_measures_is_asked_when_groups_are_known(
     monkeypatch.setattr(whole, "_search", lambda *_: next(answers))
     monkeypatch.setattr(whole, "confirmed", lambda groupings, *_: groupings)
     terminal: Any = SimpleNamespace(line=lambda *_: None)
-    ground = Ground(nothing, nothing, nothing, (), terminal, nothing)
+    ground = Ground(nothing, nothing, nothing, (), terminal, Budget())
     found = whole._search_in_groups(ground, [drag])
     if pays:
         assert isinstance(found, Searched)

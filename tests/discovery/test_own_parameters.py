@@ -116,9 +116,9 @@ def test_groups_of_two_columns_and_what_was_never_seen() -> None:
     }  # fmt: skip
     fitter, begun = search.fitter, list[Hypothesis]()
 
-    def noted(hypotheses: Sequence[Hypothesis]) -> list[Optimum]:
+    def noted(hypotheses: Sequence[Hypothesis], hopes: Any = None) -> list[Optimum]:
         begun.extend(hypotheses)
-        return fitter(hypotheses)
+        return fitter(hypotheses, hopes=hopes)
 
     search.fitter = noted  # type: ignore[assignment]
     search.base()

@@ -223,4 +223,4 @@ def _holds(search: Search, trial: Trial, begun: Trial) -> bool:
 def _best_next_gain(search: Search, trial: Trial) -> float:
     """Return what the best next effect promises beside a trial's, nats."""
     named = [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on]
-    return max((score.sure for score in search.promises(trial, search.starts(trial, named))), default=0.0)
+    return max([0.0, *(score.sure for score in search.promises(trial, search.starts(trial, named)))])

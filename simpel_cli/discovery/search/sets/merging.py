@@ -7,8 +7,8 @@ import numpy as np
 from simpel_cli.discovery.search.score_test import has_size
 from simpel_cli.discovery.search.sets.selection import nameless, worth
 from simpel_cli.discovery.search.trials import ACCEPT, SHARE, Search, Stage, Trial, asked
-from simpel_cli.filtering.likelihood.fit import Hypothesis
-from simpel_cli.filtering.race import hopeful
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.race import MARGIN, hopeful
 from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
 SLACK = 10.0  # nats by which the widths of priors may differ
@@ -42,9 +42,13 @@ def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stag
     fits = search.fitter(
         [hypothesis for _, hypothesis in begun], hopes=lambda optima: hopeful(optima, [needed] * len(optima))
     )
-    reached = dict.fromkeys(terms for (terms, _), fit in zip(begun, fits, strict=True) if not fit.left)
+
+    def came(fit: Optimum) -> bool:
+        return not fit.left and fit.loss <= needed + MARGIN
+
+    reached = dict.fromkeys(terms for (terms, _), fit in zip(begun, fits, strict=True) if came(fit))
     for (terms, _), fit in zip(begun, fits, strict=True):
-        if not fit.left:
+        if came(fit):
             search.best(terms, [fit])
     most, found = worth(chosen), None
     for less in dict.fromkeys(terms[:-1] for terms in reached):
