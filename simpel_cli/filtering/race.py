@@ -25,7 +25,9 @@ def hopeful(optima: Sequence[Optimum], losses: Sequence[float]) -> list[bool]:
 
 @dataclass(frozen=True)
 class Race:
-    """Which fits of a stage go on.
+    """Which fits of a stage go on: all that may come as far as a share of the one that is ahead, the one of most evidence.
+
+    A fit with many unknowns may have the least loss, and not be worth its unknowns.
 
     Args:
         loss: of the model before, nats.
@@ -40,7 +42,9 @@ class Race:
     def __call__(self, optima: Sequence[Optimum]) -> list[bool]:
         """Return which go on, that with the least loss in any case."""
         gains = np.array([self.loss - o.loss for o in optima])
-        best = gains[np.asarray(self.counts) & np.isfinite(gains)].max(initial=0.0)
-        going = hopeful(optima, [self.loss - self.share * float(best)] * len(optima))
+        worth = [o.log_evidence if counts else -np.inf for o, counts in zip(optima, self.counts, strict=True)]
+        ahead = int(np.argmax(worth))
+        best = max(float(gains[ahead]), 0.0) if np.isfinite(worth[ahead]) else 0.0
+        going = hopeful(optima, [self.loss - self.share * best] * len(optima))
         going[int(np.argmax(gains))] = True
         return going

@@ -101,6 +101,46 @@ def force(name: str) -> Expression:
     return Expression(name, acts_on="v", term="k*v", parameters={"k": {"range": [-1, 1], "unit": "1/T"}})
 
 
+class Racing:
+    """Fits of which those with one term are left behind wherever fits race, with more evidence than any other."""
+
+    width = 12
+
+    def __init__(self, row: int, neutral: float, loss: float) -> None:
+        self.row, self.neutral, self.loss = row, neutral, loss
+
+    def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
+        found = []
+        for h in hypotheses:
+            d, left = len(h.free), hopes is not None and self.row in h.free
+            beside = self.row in h.free and abs(h.z[self.row] - self.neutral) < 0.02
+            loss = self.loss if left else 60.0 if beside else 80.0
+            slope, eye = np.full(d, 200.0), np.eye(d)
+            found.append(
+                Optimum(
+                    h.z, h.free, loss, 1e4 if left else -loss, slope, 1e3 * eye, h.z[list(h.free)], eye, 8, False, left
+                )
+            )
+        return found
+
+
+@pytest.mark.parametrize(("loss", "again"), [(95.0, False), (500.0, True)])
+def test_a_fit_that_is_left_is_no_fit_of_its_model(loss: float, again: bool) -> None:
+    """Where every start of a term was left in a valley that is worse than the model without it, it begins beside that."""
+    search: Any = searched("b", [force("A"), force("B")])
+    a, b = (next(t for t, term in enumerate(search.terms) if term.effect == name) for name in "AB")
+    search.fitter = Racing(search.rows[a][0], search.plan.start[search.rows[a][0]], loss)
+    z, free = search.plan.start, search.free(())
+    eye = np.eye(len(free))
+    before = Trial((), Optimum(z, free, 100.0, -100.0, np.zeros(len(free)), eye, z[list(free)], eye, 1, True))
+    stage = search.add(before, [a, b])
+    assert {t.terms[-1] for t in stage.trials} == ({a, b} if again else {b})
+    assert all(t.optimum.log_evidence < 0 for t in stage.trials)
+    assert not any(optimum.left for optimum in search.known.values())
+    if not again:
+        assert [t for t, _ in stage.screened] == [a]
+
+
 class Table:
     """Fits whose evidence stands in a table of sets of names; a set that is not there is a nat worse than its best part."""
 

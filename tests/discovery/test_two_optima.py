@@ -33,3 +33,6 @@ def test_the_right_model_that_follows_a_sensor_finds_the_other_optimum() -> None
     # the simulator alone is compared with nothing, and begins again, too
     (alone,) = other_optima(search.plan, search.fitter, [stuck], -np.inf)
     assert alone.log_evidence == found.log_evidence
+    # one that was left on the way is no better fit, whatever its evidence seems to be there
+    lost_on_the_way = [found._replace(left=True, log_evidence=found.log_evidence + 1e3)]
+    assert other_optima(search.plan, lambda _, hopes: lost_on_the_way if _ else [], [stuck], least) == [stuck]

@@ -52,6 +52,8 @@ def test_fits_are_compared_with_a_share_of_the_best_that_counts() -> None:
     optima = [standing(best), standing(before - 100.0), standing(before - 20.0), standing(100.0)]
     assert Race(before, 0.5, np.array([True, True, True, False]))(optima) == [True, True, False, True]
     assert Race(before, 0.5, np.zeros(4, bool))(optima) == [True] * 4  # none that counts has gained
+    dear = standing(300.0)._replace(log_evidence=-950.0)  # the least loss, not worth its unknowns
+    assert Race(before, 0.5, np.ones(2, bool))([dear, standing(before - 100.0)]) == [True, True]
     worse = [standing(before + 100.0), standing(before + 50.0)]
     assert Race(before, 0.5, np.ones(2, bool))(worse) == [False, True]  # the best of them in any case
 

@@ -22,7 +22,7 @@ from simpel_cli.runs.console import Terminal
 STRONG = (
     20.0  # nats of evidence: an effect that earns so much may be uncertain on few held-out parts, if the set is not
 )
-CARRIED = 0.25  # of that evidence, which held-out parts have to bear out: together they are as many rows
+CARRIED = 0.25  # of that evidence, which held-out parts have to bear out
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
 
@@ -93,7 +93,7 @@ def gated_selection(
     Effects that are of use only together, as a delay and a slip, are judged together so. Of those that do harm the one goes
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
-    member of a set whether it helps: one of strong evidence that helps there on the whole stays where the set certainly does.
+    member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps.
     Where a use is named, harm is what is left of it with both models calibrated for that.
 
     Returns:

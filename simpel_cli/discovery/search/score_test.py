@@ -23,7 +23,7 @@ from simulators.effects.term import DELAY
 
 
 class Score(NamedTuple):
-    """What the slope at a switched-off term says.
+    """What the slope at a switched-off term says, or what a term reaches where it begins.
 
     Args:
         gain: in log posterior, nats, with the known unknowns refitted; inf where a score cannot tell.

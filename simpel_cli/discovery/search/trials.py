@@ -27,9 +27,7 @@ PROMISING = 1.5  # nats that the score must promise for a candidate to be fitted
 SHARE = 0.3  # of the largest promise, likewise
 ALIKE = 0.8  # of what the term promises whose place a rival would take
 SHARE_OF_OWN = 0.4  # likewise
-NEARLY_THE_BEST = (
-    0.7  # of the gain of a stage's best: what is less goes no further, but where a search may begin with it
-)
+NEARLY_THE_BEST = 0.7  # of the gain of a stage's best, which others have to reach where no search begins with them
 KEPT = 4  # starts of a stage that are fitted in any case
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
 NEARLY = 0.01  # of a parameter's range
@@ -55,7 +53,7 @@ class Trial(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """One step of the forward selection: every candidate's fit, best first."""
+    """One step of the forward selection: fits of the candidates that were not left behind, best first."""
 
     before: Trial
     trials: tuple[Trial, ...]  # each is `before` and one term more
@@ -266,18 +264,27 @@ class Search:
         most = np.where(named, finite[named].max(initial=0.0), finite.max(initial=0.0))
         going = [i for rank, i in enumerate(order) if rank < KEPT or promised[i] > max(least, SHARE * most[i])]
         begun = [*(starts[i] for i in going), *more]
-        fits: dict[int, list[Optimum]] = {}
+        fits, behind = dict[int, list[Optimum]](), dict[int, list[float]]()
         named = np.array([not self.terms[t].depends_on for t, _ in begun], bool)
         race = Race(before.optimum.loss, NEARLY_THE_BEST if before.terms else SHARE, named)
         for (t, _), optimum in zip(begun, self.fitter([h for _, h in begun], hopes=race), strict=True):
-            if not optimum.left:
+            if optimum.left:
+                behind.setdefault(t, []).append(optimum.loss)
+            else:
                 fits.setdefault(t, []).append(optimum)
+        # every start of a term may have been left in a valley that is worse than the model without it
+        best = max((before.optimum.loss - o.loss for own in fits.values() for o in own), default=0.0)
+        lost = {t for (t, _), s in zip(starts, sure, strict=True) if s > max(least, race.share * best)} - fits.keys()
+        worst = before.optimum.loss + ASTRAY
+        fits |= {t: [] for t, own in behind.items() if t in lost and min(own) > worst}
         # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
-        astray = [t for t, optima in fits.items() if min(o.loss for o in optima) > before.optimum.loss + ASTRAY]
+        astray = [t for t, optima in fits.items() if min((o.loss for o in optima), default=np.inf) > worst]
         for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
             fits[t].append(optimum)
         trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
-        left = {t: scores[i].sd for i, (t, _) in enumerate(starts) if t not in fits}
+        left = {
+            t: min(s.sd for s, (u, _) in zip(scores, starts, strict=True) if u == t) for t, _ in starts if t not in fits
+        }
         trials.sort(key=lambda t: -t.optimum.log_evidence)
         other = other_optima(self.plan, self.fitter, [t.optimum for t in trials], before.optimum.log_evidence)
         trials = [self.best(t.terms, [optimum]) for t, optimum in zip(trials, other, strict=True)]

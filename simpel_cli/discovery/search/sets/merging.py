@@ -12,6 +12,7 @@ from simpel_cli.filtering.race import MARGIN, hopeful
 from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
 SLACK = 10.0  # nats by which the widths of priors may differ
+PER_UNKNOWN = 4.0  # nats that an unknown less is worth, as one that the data know a hundred times better than its range
 MOST_OF_IT = 0.4  # of what two effects explain, to first order: a term in their place may have to find its shape
 SIGNALS = (*OPERATORS, SENSOR, INPUT)
 
@@ -33,18 +34,22 @@ def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stag
     alike = {pair: own for pair in pairs if (own := _alike(search, chosen, pair))}
     # from the chosen model and its noise: those go on that may come as far as an effect less has to
     begun = [
-        ((*(t for t in chosen.terms if t not in pair), new), hypothesis)
+        (terms, hypothesis)
         for pair, own in alike.items()
-        for new in own
-        for hypothesis in _in_place_of(search, chosen, pair, new)
+        for terms in [(*(t for t in chosen.terms if t not in pair), new) for new in own]
+        for hypothesis in search.hypotheses(terms, terms[-1], search.off(chosen.optimum.z, pair))
     ]
-    needed = chosen.optimum.loss + asked(len(chosen.terms)) + SLACK
+
+    def needed(fit: Optimum) -> float:
+        fewer = len(chosen.optimum.free) - len(fit.free)
+        return chosen.optimum.loss + asked(len(chosen.terms)) + SLACK + PER_UNKNOWN * max(fewer, 0)
+
     fits = search.fitter(
-        [hypothesis for _, hypothesis in begun], hopes=lambda optima: hopeful(optima, [needed] * len(optima))
+        [hypothesis for _, hypothesis in begun], hopes=lambda optima: hopeful(optima, [needed(o) for o in optima])
     )
 
     def came(fit: Optimum) -> bool:
-        return not fit.left and fit.loss <= needed + MARGIN
+        return not fit.left and fit.loss <= needed(fit) + MARGIN
 
     reached = dict.fromkeys(terms for (terms, _), fit in zip(begun, fits, strict=True) if came(fit))
     for (terms, _), fit in zip(begun, fits, strict=True):
@@ -65,18 +70,12 @@ def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stag
     return found
 
 
-def _in_place_of(search: Search, chosen: Trial, pair: tuple[int, int], new: int) -> list[Hypothesis]:
-    """Return starts at a chosen model with one effect in place of two."""
-    terms = (*(t for t in chosen.terms if t not in pair), new)
-    return search.hypotheses(terms, new, search.off(chosen.optimum.z, pair))
-
-
 def _alike(search: Search, chosen: Trial, pair: tuple[int, int]) -> list[int]:
     """Return the terms that point where a pair of effects points, before anything is fitted.
 
     Where both are switched off and nothing else has moved, what is left is what they explain. A term in their place has to
-    explain most of that, to first order, with the noise of the chosen model. A slope tells nothing of a late signal: that may
-    stand for two effects of signals, of which it shares a channel or through which it acts.
+    explain most of that, to first order, with the noise of the chosen model. What has no size is asked only where
+    it may stand for two effects of signals, of which it shares a channel or through which it acts.
     """
     rest = Trial(tuple(t for t in chosen.terms if t not in pair), chosen.optimum)
     off = rest._replace(optimum=chosen.optimum._replace(z=search.off(chosen.optimum.z, pair)))
