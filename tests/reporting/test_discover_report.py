@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import searches
@@ -198,6 +199,15 @@ def test_evidence_shows_accepted_tied_and_stopped_early(tmp_path: Path) -> None:
     assert "1 of them diverged" in texts
     assert figure.axes[1].get_title(loc="left") == "step 2: no further effect is accepted"
     assert "tie:" not in " ".join(t.get_text() for t in figure.axes[1].texts)
+
+
+def test_a_step_at_which_several_effects_were_taken_at_once_does_not_say_that_none_was(tmp_path: Path) -> None:
+    searches.directory(tmp_path, "ambiguous")
+    path = tmp_path / "candidates.parquet"
+    pd.read_parquet(path).assign(accepted=False).to_parquet(path)
+    figure = discover_evidence.draw_evidence(searches.verdict("ambiguous"), path)
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert titles == ["step 1: several effects together are worth more", "step 2: no further effect is accepted"]
 
 
 def test_the_typical_episode_is_shown(tmp_path: Path) -> None:

@@ -29,7 +29,9 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
         own = {name: column[table["step"] == step] for name, column in table.items()}
         _bars(axis, own, found, float(own["asked"][0]))
         best = np.flatnonzero(own["accepted"]).tolist()
-        what = f"+ {_label(own, best[0])}" if len(best) else "no further effect is accepted"
+        # a search that began with several effects at once has a step at which none of the candidates was taken
+        none = "no further effect is accepted" if step == steps[-1] else "several effects together are worth more"
+        what = f"+ {_label(own, best[0])}" if len(best) else none
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
     _legend(figure)
     return figure
