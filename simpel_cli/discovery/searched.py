@@ -1,29 +1,25 @@
 """A whole search: in clean measurements, with the inputs between rows and the differences between groups that it finds."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
-from simpel_cli.data import Recording, read
-from simpel_cli.discovery.ground import Ground, counted, ground_of
-from simpel_cli.discovery.search.acceptance import accepted, proposed, with_interactions
-from simpel_cli.discovery.search.again import Earlier
+from simpel_cli.data import Recording
+from simpel_cli.discovery.ground import Ground, ground_of
+from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed, with_interactions
+from simpel_cli.discovery.search.again import Earlier, beside
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
-from simpel_cli.discovery.search.latency import Latency, estimated, same_readings
-from simpel_cli.discovery.search.latency import in_words as in_words_of_latency
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
-from simpel_cli.discovery.search.smaller import carried, fitter_of, small_search
+from simpel_cli.discovery.search.smaller import fitter_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
@@ -33,11 +29,10 @@ from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, cali
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
-from simpel_cli.filtering.measurements.cleaning import outlier_check, without_computed
+from simpel_cli.filtering.measurements.cleaning import outlier_check
 from simpel_cli.filtering.measurements.windows import Windows, thinned
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, setup, terms_of, whole_windows, with_memory
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, terms_of, whole_windows, with_memory
 from simpel_cli.runs.console import Terminal
-from simpel_cli.studies.declared import Declared
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression
 from simulators.model import Model
@@ -77,42 +72,6 @@ class Searched(NamedTuple):
     again: "Again | None" = None
 
 
-def latencies_of(study: Study, data_folder: Path, terminal: Terminal) -> dict[str, Latency]:
-    """Estimate the latencies that the data give by a range, with the simulator as it is."""
-    model, measurements = study.system.source, study.measurements
-    ranges = measurements.latency_ranges()
-    if not ranges:
-        return {}
-    assert isinstance(model, Model)
-    options: Discovery = study.declared.groups.get("discovery") or Discovery()
-    names = [*(q.name for q in model.states), *study.recording.outputs]
-    columns = {name: names.index(name) for name in ranges}
-    longest = {name: high for name, (_, high) in ranges.items()}
-    known: list[tuple[Setup, Trial]] = []  # the best calibration so far: another latency moves it little
-
-    def evidence(at: Mapping[str, float]) -> float:
-        own = replace(measurements, latency=dict(measurements.latency) | dict(at))
-        recording = without_computed(read(own, model, data_folder, 0, whole=False), model)
-        recording = counted(same_readings(recording, columns, at, longest, model.dt), study)
-        plan = setup(model, recording, tuple(own.noise_std), [], options.substeps, most_rows=options.rows)
-        optimum = carried(known[-1][0], known[-1][1].optimum.z, plan) if known else None
-        base = small_search(plan._replace(optimum=optimum), options.lanes, 1).base()
-        if not known or base.optimum.log_evidence > known[-1][1].optimum.log_evidence:
-            known.append((plan, base))
-        return float(base.optimum.log_evidence)
-
-    found = estimated(evidence, ranges, model.dt)
-    terminal.line(in_words_of_latency(found), "latency")
-    return found
-
-
-def with_latencies(declared: Declared, found: dict[str, Latency]) -> Declared:
-    """Return the configuration whose data say how late each reading is, so that whatever follows takes it so."""
-    data = declared.config["data"]
-    said = {name: round(each.value, 12) for name, each in found.items()}
-    return declared.changed(data=data | {"latency": dict(data.get("latency") or {}) | said})
-
-
 class Again(NamedTuple):
     """Effects with a state of their own, with which a search is worth making again.
 
@@ -125,6 +84,19 @@ class Again(NamedTuple):
     memory: Memory
     earlier: Earlier | None
     effects: list[Expression] | None = None
+
+
+def _asked_for(
+    earlier: Earlier, memory: Memory, chosen_too: bool, attach: Callable[..., Setup], options: Discovery, terminal: Terminal
+) -> Again | None:  # fmt: skip
+    """Return the search with effects that have a state of their own, where one of them earns what it promises to."""
+    if not chosen_too:
+        return Again(memory, None)
+    found = beside(earlier, attach, memory.terms, options.lanes)
+    if found is None:
+        terminal.line(f"{memory.label} promises +{memory.gain:.0f}, and earns less than it has to", "memory")
+        return None
+    return Again(memory, found)
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
@@ -257,17 +229,41 @@ def _search(
 
 
 def _chosen_in(
-    found: Calibrated, assessor: Assessor, options: Discovery, terminal: Terminal,
-    wider: Callable[[Search, Trial], Wider | None], earlier: Earlier | None = None,
-) -> tuple[Selection, list[Gate]] | Wider:  # fmt: skip
-    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow."""
-    proposal = proposed(found.search, assessor, found.base, options, earlier=earlier)
-    if (ends := wider(found.search, proposal.chosen)) is not None:
-        return ends._replace(earlier=Earlier(found.search, proposal.chosen))
-    judged, gates = accepted(found.search, assessor, proposal, terminal, options.for_ or ONE_STEP)
-    left = judged.chosen.terms != proposal.chosen.terms  # what was refused may have made up for a range
-    ends = wider(found.search, judged.chosen) if left else None
-    return (judged, gates) if ends is None else ends._replace(earlier=Earlier(found.search, judged.chosen))
+    found: Calibrated, assessor: Assessor, ground: Ground, wider: Callable[[Search, Trial], Wider | None],
+    earlier: Earlier | None = None,
+) -> tuple[Calibrated, Selection, list[Gate]] | Wider:  # fmt: skip
+    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow, or the wrong noise.
+
+    What is judged last has the noise that its own residuals show: what was refused may have made up for a range, or have hidden
+    heavy tails.
+    """
+    options, gates, judged = ground.options, list[Gate](), False
+    selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
+    while True:
+        if (ends := wider(found.search, selection.chosen)) is not None:
+            return ends._replace(earlier=Earlier(found.search, selection.chosen))
+        heavy = _heavy(found, assessor, selection, ground)
+        if heavy is not None:
+            earlier, found = Earlier(found.search, selection.chosen), heavy
+            selection, judged = proposed(found.search, assessor, found.base, options, earlier=earlier), False
+            continue
+        if judged:
+            return found, selection, gates
+        before, judged = selection.chosen.terms, True
+        selection, gates = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP)
+        if selection.chosen.terms == before:
+            return found, selection, gates
+
+
+def _heavy(found: Calibrated, assessor: Assessor, selection: Selection, ground: Ground) -> Calibrated | None:
+    """Return the calibration with heavy tails where the noise has them and is not known to; else None."""
+    # beside what is left unexplained, no data tell whether tails are heavy
+    if found.degrees_of_freedom or selection.remainder or ground.budget.over("heavy tails of the noise"):
+        return None
+    heavy = with_heavy_tails(found, assessor, selection.chosen.optimum.z, ground.terminal)
+    if heavy is not None:
+        heavy.search.budget = ground.budget
+    return heavy
 
 
 def _with(
@@ -313,10 +309,10 @@ def _with(
         # a state that is missing may be what a parameter at the end of its range makes up for
         promising = remembering(at_base := NoiseProfile(found.search, assessor, found.base), at_base)
         return Again(promising[0], None) if promising and promising[0].gain > ends.gain - TIE else ends
-    outcome = _chosen_in(found, assessor, options, terminal, wider, ground.earlier)
+    outcome = _chosen_in(found, assessor, ground, wider, ground.earlier)
     if isinstance(outcome, Wider):
         return outcome
-    selection, gates = outcome
+    found, selection, gates = outcome
     said, chosen = words_of(between_rows), selection.chosen
     if said and chosen.terms and not ground.budget.over("inputs between rows, beside the effects"):
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
@@ -324,23 +320,19 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan, earlier = attach(saying(model, between_rows), kept=kept), Earlier(found.search, chosen)
         assessor, found = begun_in(plan)
-        outcome = _chosen_in(found, assessor, options, terminal, wider, earlier)
+        outcome = _chosen_in(found, assessor, ground, wider, earlier)
         if isinstance(outcome, Wider):
             return outcome
-        selection, gates = outcome
+        found, selection, gates = outcome
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
             return beside, Earlier(found.search, selection.chosen)
         own = beside  # what it is worth beside the effects
-    # beside what is left unexplained, no data tell whether tails are heavy
-    skip = bool(selection.remainder) or ground.budget.over("heavy tails of the noise")
-    heavy = None if skip else with_heavy_tails(found, assessor, selection.chosen.optimum.z, terminal)
-    if heavy is not None:
-        found, earlier = heavy, Earlier(found.search, selection.chosen)
-        found.search.budget = ground.budget
-        selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
-        selection, gates = accepted(found.search, assessor, selection, terminal, options.for_ or ONE_STEP)
+    judged = selection.chosen.terms
+    selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
+    if selection.chosen.terms != judged and (ends := wider(found.search, selection.chosen)) is not None:
+        return ends._replace(earlier=Earlier(found.search, selection.chosen))
     search, windows = found.search, found.test
     by_simulations = None
     if options.simulations and not ground.budget.over("a search by simulations"):
@@ -362,9 +354,8 @@ def _with(
     alone = drifting(alone_levels) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
-        memory, chosen_too = promising
-        again = Again(memory, Earlier(search, selection.chosen) if chosen_too else None)
-        if not model.groups:
+        again = _asked_for(Earlier(search, selection.chosen), *promising, attach_said, options, terminal)
+        if again is not None and not model.groups:
             return again
     # what simulations have chosen need not be worth anything one row ahead
     if by_simulations is None and stands_for(alone, selection.base, selection.chosen):

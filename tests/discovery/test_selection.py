@@ -14,7 +14,7 @@ from test_disturbances import pushed
 from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import searched as searched_module
 from simpel_cli.discovery.search import acceptance, calibration
-from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, proposed
+from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, judgement, proposed
 from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import calibrated
@@ -484,8 +484,8 @@ def test_what_a_search_returns_has_been_judged_though_harm_never_ends(monkeypatc
     none: Any = None
     search: Any = SimpleNamespace(banned=set(), budget=Budget())
     first: Any = SimpleNamespace(chosen=SimpleNamespace(terms=()))
-    monkeypatch.setattr(acceptance, "rivalled", lambda _, found: found)
-    selection, gates = unwrap(accepted)(search, none, first, none)
+    monkeypatch.setattr(acceptance, "condensed", lambda _, found: found)
+    selection, gates = unwrap(judgement)(search, none, first, none)
     assert len(judged) == MOST_SEARCHES
     assert gates == [selection]
 
@@ -506,8 +506,8 @@ def test_what_is_left_where_a_function_makes_an_effect_superfluous_is_judged_aga
     monkeypatch.setattr(acceptance, "rivalled", lambda _, found: one if found is both else found)
     nothing: Any = None
     first: Any = both
-    assert unwrap(accepted)(nothing, nothing, first, nothing)[0] is (none if refused else one)
-    assert judged == [(1, 2), (1,)]
+    assert unwrap(accepted)(nothing, nothing, first, [], nothing)[0] is (none if refused else one)
+    assert judged == [(1,)]
 
 
 def test_an_accepted_effect_stays_where_the_one_in_its_place_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -521,7 +521,7 @@ def test_an_accepted_effect_stays_where_the_one_in_its_place_is_refused(monkeypa
     monkeypatch.setattr(acceptance, "rivalled", lambda search, found: found if 2 in search.banned else new)
     nothing: Any = None
     first: Any = old
-    assert unwrap(accepted)(search, nothing, first, nothing) == (old, ["judged"])
+    assert unwrap(accepted)(search, nothing, first, ["judged"], nothing) == (old, ["judged"])
     assert search.banned == {2}
 
 
@@ -564,20 +564,57 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
         asked_of.append(chosen.name)
         return wider if chosen.name == asks else None
 
-    def accept(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
+    def judge(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
         judgements.append(selection)
         return judged, []
 
     monkeypatch.setattr(searched_module, "proposed", lambda *_, **__: proposal)
-    monkeypatch.setattr(searched_module, "accepted", accept)
+    monkeypatch.setattr(searched_module, "judgement", judge)
+    monkeypatch.setattr(searched_module, "_heavy", lambda *_: None)
     none: Any = None
     found: Any = SimpleNamespace(search=none, base=none)
-    options: Any = SimpleNamespace(for_=None)
-    outcome = unwrap(_chosen_in)(found, none, options, none, ends)
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
+    outcome = unwrap(_chosen_in)(found, none, ground, ends)
     chosen = proposal.chosen if asks == "proposed" else judged.chosen
-    assert outcome == (wider._replace(earlier=Earlier(none, chosen)) if asks else (judged, []))
+    assert outcome == (wider._replace(earlier=Earlier(none, chosen)) if asks else (found, judged, []))
     assert asked_of == questions
     assert judgements == ([] if asks == "proposed" else [proposal])
+
+
+@pytest.mark.parametrize("shown_by", ["proposed", "judged"])
+def test_what_is_judged_last_has_the_noise_that_its_own_residuals_show(
+    shown_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heavy tails are asked before anything is judged, and again where something was refused, which may have hidden them."""
+    model = lambda name, count: SimpleNamespace(name=name, chosen=SimpleNamespace(terms=tuple(range(count))))  # noqa: E731
+    proposal, kept = model("proposed", 2), model("judged", 1)
+    searches: list[tuple[str, object]] = []
+    gaussian, heavy = (SimpleNamespace(search=name, base=None) for name in ("gaussian", "heavy"))
+
+    def propose(search: str, *_: Any, earlier: Any = None, **__: Any) -> Any:
+        searches.append((search, earlier and earlier.search))
+        return proposal if search == "gaussian" else kept
+
+    judgements: list[tuple[str, str]] = []
+
+    def judge(search: str, _: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
+        judgements.append((search, selection.name))
+        return kept, []
+
+    def tails(found: Any, _: Any, selection: Any, __: Any) -> Any:
+        return heavy if found is gaussian and selection.name == shown_by else None
+
+    monkeypatch.setattr(searched_module, "proposed", propose)
+    monkeypatch.setattr(searched_module, "judgement", judge)
+    monkeypatch.setattr(searched_module, "_heavy", tails)
+    none: Any = None
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
+    first: Any = gaussian
+    outcome = unwrap(_chosen_in)(first, none, ground, lambda *_: None)
+    assert outcome == (heavy, kept, [])
+    assert searches == [("gaussian", None), ("heavy", "gaussian")]
+    assert judgements[-1] == ("heavy", "judged")
+    assert (("gaussian", "proposed") in judgements) == (shown_by == "judged")
 
 
 def test_a_name_that_does_better_beside_what_came_later_takes_the_place_of_another(

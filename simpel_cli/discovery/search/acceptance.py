@@ -7,7 +7,7 @@ from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.harm import growing_for
 from simpel_cli.discovery.search.held_out_gate import Gate, gates
 from simpel_cli.discovery.search.near import far
-from simpel_cli.discovery.search.sets.forward import further, selected, widely
+from simpel_cli.discovery.search.sets.forward import condensed, further, selected, widely
 from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, cut, refused
 from simpel_cli.discovery.search.settings import Discovery
@@ -46,13 +46,10 @@ def proposed(
     return widely(search, selection) if far(search, assessor, selection.chosen) else selection
 
 
-def accepted(
+def judgement(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP
 ) -> tuple[Selection, list[Gate]]:
     """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for.
-
-    The rivals are named last, of what is accepted. Where a function without a name makes an effect superfluous, the others are
-    judged without it.
 
     Args:
         search: over sets of effects.
@@ -61,8 +58,9 @@ def accepted(
         terminal: takes lines.
         use: what the model will be calibrated for in the end.
     """
+    selection = condensed(search, selection)
     for attempt in range(MOST_SEARCHES):
-        selection, judged, harmful = gated_selection(search, assessor, selection, terminal, use)
+        selection, found, harmful = gated_selection(search, assessor, selection, terminal, use)
         last = attempt == MOST_SEARCHES - 1 or (
             harmful and search.budget.over("what an effect that did harm stood for")
         )
@@ -71,18 +69,37 @@ def accepted(
         left, selection = selection, further(search, selection)
         if selection.chosen.terms == left.chosen.terms:
             break
+    return selection, found
+
+
+def accepted(
+    search: Search, assessor: Assessor, selection: Selection, found: list[Gate], terminal: Terminal,
+    use: str | float = ONE_STEP,
+) -> tuple[Selection, list[Gate]]:  # fmt: skip
+    """Name the rivals of what was judged.
+
+    Where one does better, or a function without a name makes an effect superfluous, the others are judged again.
+
+    Args:
+        search: over sets of effects.
+        assessor: of errors ahead.
+        selection: what is left of what was proposed.
+        found: its gates.
+        terminal: takes lines.
+        use: as of `judgement`.
+    """
     while True:
         named = rivalled(search, selection)
         if named.chosen.terms == selection.chosen.terms:
-            return named, judged
+            return named, found
         after, gates_after, _ = gated_selection(search, assessor, named, terminal, use)
         refused = {*named.chosen.terms} - {*selection.chosen.terms} - {*after.chosen.terms}
         if refused:  # what would have taken the place of another: that was accepted, and stays
             search.banned |= refused
             continue
-        selection, judged = after, gates_after
+        selection, found = after, gates_after
         if selection.chosen.terms == named.chosen.terms:
-            return selection, judged
+            return selection, found
 
 
 def gated_selection(

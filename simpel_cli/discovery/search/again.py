@@ -1,11 +1,13 @@
 """A search that is made once more, in other ranges or with other noise, begins with what the last one chose, too."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from simpel_cli.discovery.search.smaller import carried
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.smaller import carried, carried_windows, fitted_again, small_search
+from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
-from simpel_cli.filtering.setup import key_of
+from simpel_cli.filtering.setup import Setup, key_of, members
+from simulators.effects import Term
 
 
 class Earlier(NamedTuple):
@@ -33,3 +35,28 @@ def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
     starts = [Hypothesis(search.off(z, terms[k + 1 :]), search.free(here), search.ones) for k, here in enumerate(sets)]
     fits = search.fitter(starts)
     return (base, *(search.best(here, [fit]) for here, fit in zip(sets, fits, strict=True)))
+
+
+def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], side_by_side: int) -> Earlier | None:
+    """Return what was chosen and the one of some new terms that earns most beside it; None: none earns what it has to.
+
+    A search with terms that its program has no room for begins from the start: they are asked in a small program first.
+
+    Args:
+        earlier: what was chosen.
+        attach: (kept, extra) -> the setup of a program with these terms alone.
+        new: terms that the search did not have.
+        side_by_side: fits that run side by side.
+    """
+    search, chosen = earlier
+    plan = attach(kept=frozenset(key_of(search.terms[t]) for t in chosen.terms), extra=new)
+    plan = plan._replace(windows=carried_windows(search.plan, plan), spare=None)
+    own, one_more = sum(len(search.all_rows(t)) for t in chosen.terms), max(len(t.parameters) for t in new)
+    small = small_search(plan, side_by_side, own + one_more + members(plan))
+    before = fitted_again(small, search, chosen)
+    keys = {key_of(t) for t in new}
+    stage = small.add(before, [t for t, term in enumerate(small.terms) if key_of(term) in keys])
+    if not stage.trials:
+        return None
+    gain = stage.trials[0].optimum.log_evidence - before.optimum.log_evidence
+    return Earlier(small, stage.trials[0]) if gain > asked(len(chosen.terms) + 1) else None

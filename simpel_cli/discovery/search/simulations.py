@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simpel_cli.discovery.search.acceptance import accepted, proposed
+from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.smaller import carried, names_of
+from simpel_cli.discovery.search.smaller import carried, carried_windows, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
@@ -32,12 +32,7 @@ def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter:
         fitter: of a setup.
     """
     plan, old = attach(), found.plan
-    windows = plan.windows._replace(
-        ok=old.windows.ok, start=plan.windows.start.copy(), spread=plan.windows.spread.copy()
-    )
-    known = len(old.augmented.model.states)
-    windows.start[:, :known], windows.spread[:, :known] = old.windows.start, old.windows.spread
-    plan = plan._replace(windows=windows, spare=None)
+    plan = plan._replace(windows=carried_windows(old, plan), spare=None)
     plan = plan._replace(optimum=_begun(old, base.optimum.z, plan))
     search = Search(plan, fitter(plan), found.report)
     search.budget, search.banned = found.budget, set(found.banned)
@@ -74,7 +69,8 @@ def chosen_by_simulations(
         path.append(simulated.best(trial.terms, simulated.fitter([start])))
     own = path[-1]
     other = proposed(simulated, assessor, path[0], options, tuple(path))
-    other, gates = accepted(simulated, assessor, other, terminal)
+    other, gates = judgement(simulated, assessor, other, terminal)
+    other, gates = accepted(simulated, assessor, other, gates, terminal)
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")

@@ -6,6 +6,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup, key_of
 
 
@@ -39,6 +40,16 @@ def carried(old: Setup, z: np.ndarray, new: Setup) -> np.ndarray:
         if name in values:
             start[i] = new.coordinates.unit(i, values[name])
     return start
+
+
+def carried_windows(old: Setup, new: Setup) -> Windows:
+    """Return the windows of one setup in another of the same measurements; what only that knows begins as it says."""
+    known, names = ([q.name for q in plan.augmented.model.states] for plan in (old, new))
+    start, spread = new.windows.start.copy(), new.windows.spread.copy()
+    both = [name for name in names if name in known]
+    there, here = [names.index(name) for name in both], [known.index(name) for name in both]
+    start[:, there], spread[:, there] = old.windows.start[:, here], old.windows.spread[:, here]
+    return old.windows._replace(start=start, spread=spread)
 
 
 def names_of(plan: Setup) -> list[str]:

@@ -36,17 +36,17 @@ class _Grown(NamedTuple):
 def select(
     search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS, begun: tuple[Trial, ...] = ()
 ) -> Selection:
-    """Search, from the calibrated simulator if it is known already; names the rivals of what was chosen.
+    """Search, from the calibrated simulator if it is known already; one effect in place of two, and rivals of what was chosen.
 
     Args: as of `selected`.
     """
-    return rivalled(search, selected(search, base, beginnings, begun))
+    return rivalled(search, condensed(search, selected(search, base, beginnings, begun)))
 
 
 def selected(
     search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS, begun: tuple[Trial, ...] = ()
 ) -> Selection:
-    """Search, from the calibrated simulator if it is known already; rivals are not asked yet.
+    """Search, from the calibrated simulator if it is known already; one effect in place of two is not asked yet, nor rivals.
 
     Args:
         search: over the sets of effects of one setup.
@@ -64,7 +64,7 @@ def selected(
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
-    return _settled(search, _paired(search, grown))
+    return _ended(search, _paired(search, grown))
 
 
 def further(search: Search, found: Selection) -> Selection:
@@ -74,7 +74,7 @@ def further(search: Search, found: Selection) -> Selection:
     risen = grown.path[-1].optimum.log_evidence - found.chosen.optimum.log_evidence
     if grown.path[-1].terms == found.chosen.terms and risen < ASTRAY:
         return found._replace(stages=stages, remainder=found.remainder or grown.remainder)
-    return _settled(search, grown._replace(stages=stages))
+    return condensed(search, _ended(search, grown._replace(stages=stages)))
 
 
 def widely(search: Search, found: Selection) -> Selection:
@@ -87,7 +87,7 @@ def widely(search: Search, found: Selection) -> Selection:
         beside = _grow(search, found.path, widely=True)
         others.append(beside._replace(stages=(*found.stages[:-1], *beside.stages)))  # the last one found nothing more
     best = max(others, key=lambda g: worth(g.path[-1]))
-    return found if worth(best.path[-1]) < worth(found.chosen) + ASTRAY else _settled(search, best)
+    return found if worth(best.path[-1]) < worth(found.chosen) + ASTRAY else _ended(search, best)
 
 
 def _paired(search: Search, grown: _Grown) -> _Grown:
@@ -103,20 +103,29 @@ def _paired(search: Search, grown: _Grown) -> _Grown:
     return grown
 
 
-def _settled(search: Search, grown: _Grown) -> Selection:
-    """Drop what is not needed in the end, and put one term in the place of two where one will do."""
+def condensed(search: Search, found: Selection) -> Selection:
+    """Put one term in the place of two chosen ones where one will do, and go on from there.
+
+    With many effects it takes longer than what came before: it is asked of what is known to be in the right ranges.
+    """
     for merger in range(MOST_MERGERS + 1):
-        grown, chosen, gains = _pruned(search, grown)
-        stage = merged(search, chosen)
-        if stage is None or nameless(search, stage.trials[0]) or merger == MOST_MERGERS:
+        stage = merged(search, found.chosen)
+        if stage is None or merger == MOST_MERGERS:
             break
         whole = stage.trials[0]
+        if nameless(search, whole):
+            return found._replace(instead=whole)
         search.report(f"{search.terms[whole.terms[-1]].label} in place of two")
         again = _grow(search, path_of(search, whole))
-        grown = again._replace(stages=(*grown.stages, stage, *again.stages))
+        found = _ended(search, again._replace(stages=(*found.stages, stage, *again.stages)))
+    return found
+
+
+def _ended(search: Search, grown: _Grown) -> Selection:
+    """Drop what is not needed in the end."""
+    grown, chosen, gains = _pruned(search, grown)
     path = path_of(search, chosen)
-    instead = stage.trials[0] if stage is not None and nameless(search, stage.trials[0]) else None
-    return Selection(path[0], chosen, path, (), grown.stages, gains, grown.remainder, instead)
+    return Selection(path[0], chosen, path, (), grown.stages, gains, grown.remainder)
 
 
 def _pruned(search: Search, grown: _Grown) -> tuple[_Grown, Trial, tuple[float, ...]]:

@@ -35,9 +35,14 @@ class Memory(NamedTuple):
     gain: float
 
     @property
+    def label(self) -> str:
+        """What they are called."""
+        return " or ".join(t.label for t in self.terms)
+
+    @property
     def words(self) -> str:
         """What is said of them."""
-        return f"{' or '.join(t.label for t in self.terms)} promises +{self.gain:.0f}: searching once more with it"
+        return f"{self.label} promises +{self.gain:.0f}: searching once more with it"
 
 
 def worth_a_search(levels: NoiseProfile, alone: NoiseProfile, terms: Sequence[Term]) -> tuple[Memory, bool] | None:
