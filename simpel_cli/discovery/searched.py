@@ -335,7 +335,7 @@ def _with(
         return ends._replace(earlier=Earlier(found.search, selection.chosen))
     search, windows = found.search, found.test
     by_simulations = None
-    if options.by_simulations and not ground.budget.over("a search by simulations"):
+    if options.by_simulations(grouped=bool(model.groups)) and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
         ahead = assessor.of(simulated.plan)
