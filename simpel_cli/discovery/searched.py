@@ -7,7 +7,7 @@ from typing import NamedTuple
 from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed, with_interactions
-from simpel_cli.discovery.search.again import Earlier, beside
+from simpel_cli.discovery.search.again import Earlier, beside, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
@@ -189,7 +189,7 @@ def _settled_in_groups(ground: Ground, effects: list[Expression]) -> tuple[Searc
             break
         ungrouped, effects = effects, grouped
         ground.terminal.line("searching once more with it", "groups")
-        known = Earlier(found.search, found.selection.chosen)
+        known = chosen_of(found, found.selection)
         again = _search(ground._replace(earlier=known), effects, [g for g in found.groupings if g.parameter])
         if not isinstance(again, Searched):
             return again, effects
@@ -228,42 +228,52 @@ def _search(
         terminal.line("searching once more", "groups")
 
 
+class _Heavy(NamedTuple):
+    """A calibration with heavy tails, and what was chosen without them."""
+
+    found: Calibrated
+    earlier: Earlier
+
+
 def _chosen_in(
     found: Calibrated, assessor: Assessor, ground: Ground, wider: Callable[[Search, Trial], Wider | None],
     earlier: Earlier | None = None,
 ) -> tuple[Calibrated, Selection, list[Gate]] | Wider:  # fmt: skip
-    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow, or the wrong noise.
+    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow, or the wrong noise."""
+    options = ground.options
 
-    What is judged last has the noise that its own residuals show: what was refused may have made up for a range, or have hidden
-    heavy tails.
-    """
-    options, gates, judged = ground.options, list[Gate](), False
-    selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
-    while True:
+    def wrong(selection: Selection) -> Wider | _Heavy | None:
         if (ends := wider(found.search, selection.chosen)) is not None:
-            return ends._replace(earlier=Earlier(found.search, selection.chosen))
-        heavy = _heavy(found, assessor, selection, ground)
-        if heavy is not None:
-            earlier, found = Earlier(found.search, selection.chosen), heavy
-            selection, judged = proposed(found.search, assessor, found.base, options, earlier=earlier), False
-            continue
-        if judged:
-            return found, selection, gates
-        before, judged = selection.chosen.terms, True
-        selection, gates = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP)
-        if selection.chosen.terms == before:
-            return found, selection, gates
+            return ends._replace(earlier=chosen_of(found, selection))
+        # beside what is left unexplained, no data tell whether tails are heavy
+        heavy = None if selection.remainder else _heavy(found, assessor, selection.chosen, ground)
+        return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
+
+    if earlier is not None and earlier.heavy and (path := path_in(found.search, found.base, earlier)):
+        found = _heavy(found, assessor, path[-1], ground) or found
+    while True:
+        selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
+        outcome = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP, wrong)
+        if isinstance(outcome, Wider):
+            return outcome
+        if not isinstance(outcome, _Heavy):
+            return found, *outcome
+        found, earlier = outcome
 
 
-def _heavy(found: Calibrated, assessor: Assessor, selection: Selection, ground: Ground) -> Calibrated | None:
-    """Return the calibration with heavy tails where the noise has them and is not known to; else None."""
-    # beside what is left unexplained, no data tell whether tails are heavy
-    if found.degrees_of_freedom or selection.remainder or ground.budget.over("heavy tails of the noise"):
+def _heavy(found: Calibrated, assessor: Assessor, trial: Trial, ground: Ground) -> Calibrated | None:
+    """Return the calibration with heavy tails where the noise has them beside a model, and is not known to; else None."""
+    if found.degrees_of_freedom or ground.budget.over("heavy tails of the noise"):
         return None
-    heavy = with_heavy_tails(found, assessor, selection.chosen.optimum.z, ground.terminal)
+    heavy = with_heavy_tails(found, assessor, trial.optimum.z, ground.terminal)
     if heavy is not None:
         heavy.search.budget = ground.budget
     return heavy
+
+
+def chosen_of(found: Calibrated | Searched, selection: Selection) -> Earlier:
+    """Return what a search has chosen, for one that is made after it."""
+    return Earlier(found.search, selection.chosen, heavy=bool(found.degrees_of_freedom))
 
 
 def _with(
@@ -318,7 +328,7 @@ def _with(
         between_rows = asked_beside(attach, model, found.search, chosen, options.lanes)
     if words_of(between_rows) != said:
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
-        plan, earlier = attach(saying(model, between_rows), kept=kept), Earlier(found.search, chosen)
+        plan, earlier = attach(saying(model, between_rows), kept=kept), chosen_of(found, selection)
         assessor, found = begun_in(plan)
         outcome = _chosen_in(found, assessor, ground, wider, earlier)
         if isinstance(outcome, Wider):
@@ -327,12 +337,12 @@ def _with(
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
         beside = own_parameters(attach, saying(declared, between_rows), options, (found.search, selection.chosen))
         if per_of(beside) != per_of(own):
-            return beside, Earlier(found.search, selection.chosen)
+            return beside, chosen_of(found, selection)
         own = beside  # what it is worth beside the effects
     judged = selection.chosen.terms
     selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
     if selection.chosen.terms != judged and (ends := wider(found.search, selection.chosen)) is not None:
-        return ends._replace(earlier=Earlier(found.search, selection.chosen))
+        return ends._replace(earlier=chosen_of(found, selection))
     search, windows = found.search, found.test
     by_simulations = None
     if options.by_simulations(grouped=bool(model.groups)) and not ground.budget.over("a search by simulations"):
@@ -354,7 +364,7 @@ def _with(
     alone = drifting(alone_levels) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
-        again = _asked_for(Earlier(search, selection.chosen), *promising, attach_said, options, terminal)
+        again = _asked_for(chosen_of(found, selection), *promising, attach_said, options, terminal)
         if again is not None and not model.groups:
             return again
     # what simulations have chosen need not be worth anything one row ahead

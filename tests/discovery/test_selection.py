@@ -17,7 +17,7 @@ from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, judgement, proposed
 from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
-from simpel_cli.discovery.search.calibration import calibrated
+from simpel_cli.discovery.search.calibration import Calibrated, calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
@@ -25,7 +25,7 @@ from simpel_cli.discovery.search.sets import forward
 from simpel_cli.discovery.search.sets.forward import further, select
 from simpel_cli.discovery.search.sets.merging import _through, merged
 from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
-from simpel_cli.discovery.search.sets.selection import cut
+from simpel_cli.discovery.search.sets.selection import Selection, cut
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -537,6 +537,35 @@ def test_a_late_signal_stands_for_two_signals_on_their_channels_or_before_them()
     assert not through(search, 0, (1, 4))  # and a force is no signal
 
 
+def test_noise_that_was_heavy_is_so_from_the_beginning_of_the_next_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = chosen_so("chosen", 1)
+    gaussian, heavy = in_noise("gaussian", {}), in_noise("heavy", {"y": 3.0})
+    asked, searches = list[str](), list[str]()
+
+    def tails(_: Any, __: Any, trial: Any, ___: Any) -> Any:
+        asked.append(trial)
+        return heavy
+
+    def propose(search: Any, *_: Any, **__: Any) -> Any:
+        searches.append(search.name)
+        return kept
+
+    monkeypatch.setattr(
+        searched_module, "path_in", lambda *_: (None, SimpleNamespace(optimum=SimpleNamespace(z="earlier")))
+    )
+    monkeypatch.setattr(searched_module, "proposed", propose)
+    monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)
+    monkeypatch.setattr(acceptance, "gated_selection", lambda *_: (kept, [], []))
+    monkeypatch.setattr(searched_module, "with_heavy_tails", tails)
+    none: Any = None
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None, budget=Budget())
+    unchecked(monkeypatch)
+    monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
+    found, _, _ = unwrap(_chosen_in)(gaussian, none, ground, lambda *_: None, Earlier(none, none, heavy=True))
+    assert found is heavy
+    assert (asked, searches) == (["earlier"], ["heavy"])
+
+
 def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     none: Any = None
     first = SimpleNamespace(chosen=1)
@@ -549,6 +578,25 @@ def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatc
     assert unwrap(proposed)(none, none, none, options) is first
 
 
+def chosen_so(name: str, count: int) -> Selection:
+    """A selection of so many effects, by a name."""
+    called: Any = name
+    chosen = Trial(tuple(range(count)), called)
+    return Selection(chosen, chosen, (), (), (), (), None)
+
+
+def in_noise(name: str, degrees_of_freedom: dict[str, float]) -> Calibrated:
+    search: Any = SimpleNamespace(name=name, budget=Budget())
+    none: Any = None
+    return Calibrated(search, none, none, none, degrees_of_freedom)
+
+
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let fakes through."""
+    monkeypatch.setattr(searched_module, "judgement", unwrap(judgement))
+    monkeypatch.setattr(searched_module, "chosen_of", unwrap(searched_module.chosen_of))
+
+
 @pytest.mark.parametrize(
     ("asks", "kept", "questions"),
     [("proposed", 1, ["proposed"]), ("judged", 0, ["proposed", "judged"]), ("", 1, ["proposed"])],
@@ -556,27 +604,28 @@ def test_where_errors_stay_far_above_the_noise_effects_begin_anywhere(monkeypatc
 def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refused(
     asks: str, kept: int, questions: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = lambda name, count: SimpleNamespace(name=name, terms=tuple(range(count)))  # noqa: E731
-    proposal, judged = (SimpleNamespace(chosen=model(name, n)) for name, n in (("proposed", 1), ("judged", kept)))
+    proposal, judged = (chosen_so(name, n) for name, n in (("proposed", 1), ("judged", kept)))
     wider, asked_of, judgements = Wider({"k": (0.0, 2.0)}, 9.0), list[str](), list[object]()
 
     def ends(_: Any, chosen: Any) -> Wider | None:
-        asked_of.append(chosen.name)
-        return wider if chosen.name == asks else None
+        asked_of.append(chosen.optimum)
+        return wider if chosen.optimum == asks else None
 
-    def judge(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
+    def judge(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any], list[int]]:
         judgements.append(selection)
-        return judged, []
+        return judged, [], []
 
     monkeypatch.setattr(searched_module, "proposed", lambda *_, **__: proposal)
-    monkeypatch.setattr(searched_module, "judgement", judge)
-    monkeypatch.setattr(searched_module, "_heavy", lambda *_: None)
+    monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)
+    monkeypatch.setattr(acceptance, "gated_selection", judge)
+    monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
+    unchecked(monkeypatch)
     none: Any = None
-    found: Any = SimpleNamespace(search=none, base=none)
+    found = Calibrated(none, none, none, none, {"y": 3.0})
     ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
     outcome = unwrap(_chosen_in)(found, none, ground, ends)
     chosen = proposal.chosen if asks == "proposed" else judged.chosen
-    assert outcome == (wider._replace(earlier=Earlier(none, chosen)) if asks else (found, judged, []))
+    assert outcome == (wider._replace(earlier=Earlier(none, chosen, heavy=True)) if asks else (found, judged, []))
     assert asked_of == questions
     assert judgements == ([] if asks == "proposed" else [proposal])
 
@@ -586,31 +635,31 @@ def test_what_is_judged_last_has_the_noise_that_its_own_residuals_show(
     shown_by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Heavy tails are asked before anything is judged, and again where something was refused, which may have hidden them."""
-    model = lambda name, count: SimpleNamespace(name=name, chosen=SimpleNamespace(terms=tuple(range(count))))  # noqa: E731
-    proposal, kept = model("proposed", 2), model("judged", 1)
+    proposal, kept = chosen_so("proposed", 2), chosen_so("judged", 1)
     searches: list[tuple[str, object]] = []
-    gaussian, heavy = (SimpleNamespace(search=name, base=None) for name in ("gaussian", "heavy"))
+    gaussian, heavy = in_noise("gaussian", {}), in_noise("heavy", {"y": 3.0})
 
-    def propose(search: str, *_: Any, earlier: Any = None, **__: Any) -> Any:
-        searches.append((search, earlier and earlier.search))
-        return proposal if search == "gaussian" else kept
+    def propose(search: Any, *_: Any, earlier: Any = None, **__: Any) -> Any:
+        searches.append((search.name, earlier and earlier.search.name))
+        return proposal if search is gaussian.search else kept
 
     judgements: list[tuple[str, str]] = []
 
-    def judge(search: str, _: Any, selection: Any, *___: Any) -> tuple[Any, list[Any]]:
-        judgements.append((search, selection.name))
-        return kept, []
+    def judge(search: Any, _: Any, selection: Any, *___: Any) -> tuple[Any, list[Any], list[int]]:
+        judgements.append((search.name, selection.chosen.optimum))
+        return kept, [], []
 
-    def tails(found: Any, _: Any, selection: Any, __: Any) -> Any:
-        return heavy if found is gaussian and selection.name == shown_by else None
+    def tails(found: Any, _: Any, trial: Any, __: Any) -> Any:
+        return heavy if found is gaussian and trial.optimum == shown_by else None
 
     monkeypatch.setattr(searched_module, "proposed", propose)
-    monkeypatch.setattr(searched_module, "judgement", judge)
+    monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)
+    monkeypatch.setattr(acceptance, "gated_selection", judge)
     monkeypatch.setattr(searched_module, "_heavy", tails)
     none: Any = None
     ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
-    first: Any = gaussian
-    outcome = unwrap(_chosen_in)(first, none, ground, lambda *_: None)
+    unchecked(monkeypatch)
+    outcome = unwrap(_chosen_in)(gaussian, none, ground, lambda *_: None)
     assert outcome == (heavy, kept, [])
     assert searches == [("gaussian", None), ("heavy", "gaussian")]
     assert judgements[-1] == ("heavy", "judged")

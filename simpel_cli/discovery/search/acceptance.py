@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.harm import growing_for
@@ -25,6 +26,8 @@ STRONG = (
 CARRIED = 0.25  # of that evidence, which held-out parts have to bear out
 MOST_SEARCHES = 3  # each goes on without the effects that did harm in those before
 
+Answer = TypeVar("Answer")
+
 
 def proposed(
     search: Search, assessor: Assessor, base: Trial, options: Discovery, begun: tuple[Trial, ...] = (), *,
@@ -47,8 +50,9 @@ def proposed(
 
 
 def judgement(
-    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP
-) -> tuple[Selection, list[Gate]]:
+    search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP,
+    ask: Callable[[Selection], Answer | None] = lambda _: None,
+) -> tuple[Selection, list[Gate]] | Answer:  # fmt: skip
     """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for.
 
     Args:
@@ -57,19 +61,26 @@ def judgement(
         selection: what is proposed.
         terminal: takes lines.
         use: what the model will be calibrated for in the end.
+        ask: whether something else has to be known first. Asked of whatever is judged, before that, and of what is left, if
+            something was refused: it may have made up for a range, or have hidden heavy tails.
+
+    Returns:
+        what is left with its gates, all of which have been judged; or the first answer.
     """
-    selection = condensed(search, selection)
-    for attempt in range(MOST_SEARCHES):
+    search_on = MOST_SEARCHES
+    while True:
+        if (answer := ask(selection)) is not None:
+            return answer
+        selection = condensed(search, selection)
+        proposal = selection.chosen.terms
         selection, found, harmful = gated_selection(search, assessor, selection, terminal, use)
-        last = attempt == MOST_SEARCHES - 1 or (
-            harmful and search.budget.over("what an effect that did harm stood for")
-        )
-        if not harmful or last:  # what is returned has been judged
-            break
-        left, selection = selection, further(search, selection)
-        if selection.chosen.terms == left.chosen.terms:
-            break
-    return selection, found
+        search_on -= 1
+        if harmful and search_on and not search.budget.over("what an effect that did harm stood for"):
+            left, selection = selection, further(search, selection)
+            if selection.chosen.terms != left.chosen.terms:
+                continue
+        answer = ask(selection) if selection.chosen.terms != proposal else None
+        return (selection, found) if answer is None else answer
 
 
 def accepted(

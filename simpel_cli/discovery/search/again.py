@@ -11,10 +11,17 @@ from simulators.effects import Term
 
 
 class Earlier(NamedTuple):
-    """What an earlier search has chosen."""
+    """What an earlier search has chosen.
+
+    Args:
+        search: it.
+        chosen: its model.
+        heavy: whether the noise had heavy tails there.
+    """
 
     search: Search
     chosen: Trial
+    heavy: bool = False
 
 
 def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
@@ -48,7 +55,7 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
         new: terms that the search did not have.
         side_by_side: fits that run side by side.
     """
-    search, chosen = earlier
+    search, chosen = earlier.search, earlier.chosen
     plan = attach(kept=frozenset(key_of(search.terms[t]) for t in chosen.terms), extra=new)
     plan = plan._replace(windows=carried_windows(search.plan, plan), spare=None)
     own, one_more = sum(len(search.all_rows(t)) for t in chosen.terms), max(len(t.parameters) for t in new)
@@ -59,4 +66,4 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
     if not stage.trials:
         return None
     gain = stage.trials[0].optimum.log_evidence - before.optimum.log_evidence
-    return Earlier(small, stage.trials[0]) if gain > asked(len(chosen.terms) + 1) else None
+    return earlier._replace(search=small, chosen=stage.trials[0]) if gain > asked(len(chosen.terms) + 1) else None

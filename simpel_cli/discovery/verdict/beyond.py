@@ -57,7 +57,10 @@ def sentence_of(found: Sequence[Beyond]) -> str:
         return ""
     parts = [f"{b.name} = {b.value:.3g} ({b.low:.3g}..{b.high:.3g}) {b.unit}, given {b.range[0]:.3g}..{b.range[1]:.3g}"
              for b in found]  # fmt: skip
-    return f" Outside the range that sim.parameters gives, by {found[0].gain:.0f} nats: {'; '.join(parts)}."
+    gain = found[0].gain
+    # where simulations have chosen, the evidence of the ordinary search may say otherwise
+    by = f", by {gain:.0f} nats" if gain > 0 else ""
+    return f" Outside the range that sim.parameters gives{by}: {'; '.join(parts)}."
 
 
 def ranges_of(found: Sequence[Beyond]) -> dict[str, dict[str, Any]]:

@@ -68,13 +68,16 @@ def selected(
 
 
 def further(search: Search, found: Selection) -> Selection:
-    """Go on from what is left of a selection whose lost effects are candidates no more: another may take their place."""
+    """Go on from what is left of a selection whose lost effects are candidates no more: another may take their place.
+
+    One effect in place of two is not asked yet.
+    """
     grown = _grow(search, found.path)
     stages = found.stages + grown.stages
     risen = grown.path[-1].optimum.log_evidence - found.chosen.optimum.log_evidence
     if grown.path[-1].terms == found.chosen.terms and risen < ASTRAY:
         return found._replace(stages=stages, remainder=found.remainder or grown.remainder)
-    return condensed(search, _ended(search, grown._replace(stages=stages)))
+    return _ended(search, grown._replace(stages=stages))
 
 
 def widely(search: Search, found: Selection) -> Selection:
