@@ -6,7 +6,7 @@ from pathlib import Path
 
 from simpel_cli.data import read
 from simpel_cli.discovery.ground import counted
-from simpel_cli.discovery.search.latency import Latency, estimated, in_words, same_readings
+from simpel_cli.discovery.latency import Latency, estimated, in_words, same_readings
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, small_search
 from simpel_cli.discovery.search.trials import Trial

@@ -12,13 +12,13 @@ from simpel_cli.config.build import build_settings
 from simpel_cli.config.compose import Job
 from simpel_cli.config.resolved import dump
 from simpel_cli.discovery.latencies import latencies_of, with_latencies
+from simpel_cli.discovery.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.next_experiment.determining import determining_experiments
 from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentence_of
 from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
-from simpel_cli.discovery.search.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.searched import Searched, search_of
 from simpel_cli.discovery.verdict.beyond import Beyond, beyond, ranges_of

@@ -18,7 +18,7 @@ from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, cut
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
+from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
 from simpel_cli.discovery.search.smaller import fitter_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
@@ -345,7 +345,12 @@ def _with(
         return ends._replace(earlier=chosen_of(found, selection))
     search, windows = found.search, found.test
     by_simulations = None
-    if options.by_simulations(grouped=bool(model.groups)) and not ground.budget.over("a search by simulations"):
+    simulate = options.simulations
+    if (
+        simulate is None and options.for_ == FREE_RUN and not model.groups
+    ):  # beside groups it finds what differs among them
+        simulate = worth_simulating(search, assessor, selection)
+    if simulate and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
         ahead = assessor.of(simulated.plan)

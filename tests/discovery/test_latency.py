@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.latency import estimated, in_words, same_readings, sentence_of
+from simpel_cli.discovery.latency import estimated, in_words, same_readings, sentence_of
 
 
 @pytest.mark.parametrize(("true", "at_end"), [(0.0371, False), (0.2, True)])

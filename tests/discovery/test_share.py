@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simpel_cli.discovery.verdict.share import explained
+from simpel_cli.discovery.search.share import explained
 
 NOISE = np.array([0.1, 1.0])
 

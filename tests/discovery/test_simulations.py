@@ -8,7 +8,7 @@ from test_ranges import DRAG, cart, measured, searched
 
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating
+from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
 from simpel_cli.discovery.search.smaller import carried, names_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -111,3 +111,13 @@ def test_what_is_switched_off_beyond_its_range_stays_so() -> None:
     row, there = (names_of(plan).index("limit_u_top") for plan in (old, new))
     assert old.start[row] > 1
     assert carried(old, old.start, new)[there] == new.start[there] == old.start[row]
+
+
+def test_what_explains_most_of_a_free_run_asks_for_no_simulations() -> None:
+    recording = measured(B, k=K)
+    search = searched(recording)
+    assessor = Assessor(search.plan, 10)
+    found = select(search, search.base())
+    assert found.chosen.terms
+    assert not worth_simulating(search, assessor, found)
+    assert worth_simulating(search, assessor, found._replace(chosen=found.base))  # nothing is gone

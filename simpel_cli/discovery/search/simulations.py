@@ -14,12 +14,26 @@ from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.share import shares
 from simpel_cli.discovery.search.smaller import carried, carried_windows, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
-from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.errors_ahead import Assessor, rmse
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
+
+NEARLY_ALL = 0.8  # of the mean square error of a free run beyond the noise: beside that simulations ask for little
+
+
+def worth_simulating(found: Search, assessor: Assessor, selection: Selection) -> bool:
+    """Whether what an ordinary search has found leaves much of the error of a free run, of any quantity."""
+    plan = found.plan
+    n_p, n_r, _ = plan.coordinates.sizes
+    z = selection.chosen.optimum.z
+    noise = np.array([plan.coordinates.value(i, float(z[i])) for i in range(n_p, n_p + n_r)])
+    before, after = (rmse(assessor(trial.optimum.z, plan.windows).free) for trial in (selection.base, selection.chosen))
+    gone = shares(before, after, noise)
+    return bool(np.any(gone < NEARLY_ALL))
 
 
 def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter: Callable[[Setup], Fitter]) -> Search:

@@ -7,11 +7,11 @@ import numpy as np
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.held_out_gate import AHEAD, Errors, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
+from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
-from simpel_cli.discovery.verdict.share import explained
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, in_parts, reduction_interval, results, rmse
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of

@@ -36,14 +36,22 @@ class Explained(NamedTuple):
         return self.near or bool(self.share >= (MOST if left else SOME))
 
 
+def shares(before: np.ndarray, after: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return which share of the mean square error beyond the noise is gone, (ny,); nan: none was, or that is not known."""
+    beyond = np.isfinite(before) & np.isfinite(after) & (noise > 0) & (before > NEAR * noise)
+    first, second = (np.maximum(e**2 - noise**2, 0.0) for e in (before, after))
+    return np.where(beyond, 1 - second / np.where(beyond, first, 1.0), np.nan)
+
+
 def explained(before: np.ndarray, after: np.ndarray, noise: np.ndarray) -> Explained:
     """Compare errors with the noise; all (ny,), nan where nothing was measured."""
     known = np.isfinite(before) & np.isfinite(after) & (noise > 0)
     if not known.any():
         return Explained(float("nan"), near=True, worst=0, times=float("nan"))
     times = np.where(known, after / noise, -np.inf)
-    beyond = known & (before > NEAR * noise)
-    first, second = (np.maximum(e**2 - noise**2, 0.0) for e in (before, after))
-    share = float(np.mean(1 - second[beyond] / first[beyond])) if beyond.any() else float("nan")
+    gone = shares(before, after, noise)
+    gone = gone[np.isfinite(gone)]
     worst = int(np.argmax(times))
-    return Explained(share, bool(times[worst] <= NEAR), worst, float(times[worst]))
+    return Explained(
+        float(np.mean(gone)) if gone.size else float("nan"), bool(times[worst] <= NEAR), worst, float(times[worst])
+    )
