@@ -1,6 +1,7 @@
 """Hidden states: what a chosen model leaves has a memory of a state that the simulator lacks."""
 
 import json
+from functools import partial
 from inspect import unwrap
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,17 @@ import yaml
 from command_line import TINY, simpel
 from scipy.integrate import solve_ivp
 
-from simpel_cli.data.recording import Episode
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery import searched as searched_module
+from simpel_cli.discovery.search.again import Earlier, beside
+from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, worth_a_search
 from simpel_cli.filtering.likelihood.augmented import augment
+from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.windows import windows_of
+from simpel_cli.filtering.setup import setup
+from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, Scales
 from simulators.effects.stores import with_stores
 from simulators.model import Declared, Model, ModelError
@@ -178,3 +186,46 @@ def test_columns_of_what_was_measured_are_found_beside_a_state_that_has_none() -
     )
     found = windows_of([episode], ["x", "z"], ("x", "y"), ("y",), np.zeros(2), np.ones(2), lead=0, dt=1.0)
     np.testing.assert_array_equal(found.ok[0], [[1, 0.5], [1, 0.5], [1, 0], [1, 0.5]])
+
+
+@pytest.mark.parametrize("k", [WALL["k"], 0.0], ids=["wall", "none"])
+def test_a_state_of_its_own_is_asked_beside_what_was_chosen_before_a_search_begins_again(k: float) -> None:
+    """What promises much to first order may earn nothing."""
+    rows = heaters(k, WALL["tau"])
+    episodes = [
+        Episode(str(e), part["t"].to_numpy(), part[["T"]].to_numpy(), part[["u"]].to_numpy(), np.zeros((len(part), 0)))
+        for e, part in rows.groupby("episode")
+    ]
+    data = Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"T": 0.05}, (), (Check("c", True, ""),), ())
+    model = heater()
+    attach = partial(setup, model, data, (), [], 1)
+    plan = attach(kept=frozenset())
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=6))
+    earlier = Earlier(search, search.base(), heavy=True)
+    (term,) = wall().attach(model, plan.scales, ("T",))
+    found = beside(earlier, attach, [term], 2)
+    if not k:
+        assert found is None
+        return
+    assert found is not None
+    assert found.heavy
+    assert [found.search.terms[t].effect for t in found.chosen.terms] == ["wall"]
+    # beside the same measurements, each as far as it counts
+    assert np.array_equal(found.search.plan.windows.ok, search.plan.windows.ok)
+    assert found.search.plan.windows.start.shape[1] == 2
+    assert np.array_equal(found.search.plan.windows.start[:, 0], search.plan.windows.start[:, 0])
+
+
+def test_a_search_is_made_again_only_for_a_state_that_earns_what_it_promises(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    memory, options, terminal = Memory((), 39.0), Discovery(), Terminal(False, tmp_path / "run.log")
+    none: Any = None
+    earlier, attach = Earlier(none, none), lambda **_: none
+    for outcome in (None, earlier._replace(heavy=True)):
+        monkeypatch.setattr(searched_module, "beside", lambda *_, found=outcome: found)
+        again = unwrap(searched_module._asked_for)(earlier, memory, True, attach, options, terminal)
+        assert (again and again.earlier) == outcome
+    assert "earns less than it has to" in (tmp_path / "run.log").read_text()
+    # in place of what was chosen there is nothing to ask it beside
+    assert unwrap(searched_module._asked_for)(earlier, memory, False, attach, options, terminal).earlier is None
