@@ -8,6 +8,7 @@ from simpel_cli.data import Recording
 from simpel_cli.discovery.search.again import Earlier
 from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.watch import Watch
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned
 from simpel_cli.filtering.setup import Setup, key_of, setup
@@ -28,6 +29,7 @@ class Ground(NamedTuple):
         declared_noise: channels whose noise the user declared.
         terminal: takes lines.
         budget: time that it may take.
+        watch: is told of fits.
         wider: how often ranges of the model or of effects were found too narrow.
         earlier: what was chosen before something else was known.
         remembering: effects with a state of their own that the program has room for.
@@ -39,6 +41,7 @@ class Ground(NamedTuple):
     declared_noise: tuple[str, ...]
     terminal: Terminal
     budget: Budget
+    watch: Watch
     wider: int = 0
     earlier: Earlier | None = None
     remembering: tuple[Term, ...] = ()
@@ -90,4 +93,5 @@ def ground_of(study: Study, effects: int, terminal: Terminal) -> Ground:
     rows = sum(len(e.time) for e in clean.recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    return Ground(model, clean, options, declared_noise, terminal, Budget(seconds_of(options.budget)))
+    budget = Budget(seconds_of(options.budget))
+    return Ground(model, clean, options, declared_noise, terminal, budget, Watch(budget))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed, with_interactions
-from simpel_cli.discovery.search.again import Earlier, beside, path_in
+from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
@@ -17,7 +17,6 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, cut
-from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
 from simpel_cli.discovery.search.smaller import fitter_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
@@ -69,41 +68,19 @@ class Searched(NamedTuple):
     groupings: list[Grouping]
     wider: float = 0.0
     drift: Drift | None = None
-    again: "Again | None" = None
-
-
-class Again(NamedTuple):
-    """Effects with a state of their own, with which a search is worth making again.
-
-    Args:
-        memory: they.
-        earlier: what was chosen, beside which they promise; None: they do in its place.
-        effects: with those that differ from group to group; None: as they were given.
-    """
-
-    memory: Memory
-    earlier: Earlier | None
-    effects: list[Expression] | None = None
-
-
-def _asked_for(
-    earlier: Earlier, memory: Memory, chosen_too: bool, attach: Callable[..., Setup], options: Discovery, terminal: Terminal
-) -> Again | None:  # fmt: skip
-    """Return the search with effects that have a state of their own, where one of them earns what it promises to."""
-    if not chosen_too:
-        return Again(memory, None)
-    found = beside(earlier, attach, memory.terms, options.lanes)
-    if found is None:
-        terminal.line(f"{memory.label} promises +{memory.gain:.0f}, and earns less than it has to", "memory")
-        return None
-    return Again(memory, found)
+    again: Again | None = None
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
     """Clean the measurements and search; once more with wider ranges or a hidden state; calibrate for the use that is named."""
     effects: list[Expression] = study.declared.groups["effect"]
     ground = ground_of(study, len(effects), terminal)
-    declared = ground.model
+    with terminal.working(ground.watch.__str__):
+        return _searched(ground, effects)
+
+
+def _searched(ground: Ground, effects: list[Expression]) -> Searched:
+    declared, terminal = ground.model, ground.terminal
     found = _search_in_groups(ground, effects)
     while not isinstance(found, Searched):
         if isinstance(found, Wider):
@@ -301,7 +278,9 @@ def _with(
         return None if late else too_narrow(search, trial)
 
     def fitter(plan: Setup) -> Fitter:
-        return fitter_of(plan, options.lanes, options.room + members(plan))
+        found = fitter_of(plan, options.lanes, options.room + members(plan))
+        found.watch = ground.watch
+        return found
 
     def remembering(levels: NoiseProfile, alone: NoiseProfile) -> tuple[Memory, bool] | None:
         if ground.remembering or ground.budget.over("effects with a state of their own"):
@@ -369,7 +348,7 @@ def _with(
     alone = drifting(alone_levels) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
-        again = _asked_for(chosen_of(found, selection), *promising, attach_said, options, terminal)
+        again = asked_again(chosen_of(found, selection), *promising, attach_said, options, terminal)
         if again is not None and not model.groups:
             return again
     # what simulations have chosen need not be worth anything one row ahead

@@ -70,6 +70,18 @@ class Terminal:
             self.line(f"{'' if i == 0 else ' ' * 10}{command}", "" if i else "next")
 
     @contextmanager
+    def working(self, now: Callable[[], str]) -> Iterator[None]:
+        """Show below the lines what goes on, once a second; nothing where nobody looks."""
+        if not self.console.is_terminal or self.console.quiet:
+            yield
+            return
+        from rich.live import Live
+
+        shown = lambda: Text(now(), style="dim")  # noqa: E731
+        with Live(console=self.console, get_renderable=shown, refresh_per_second=1, transient=True):
+            yield
+
+    @contextmanager
     def progress(self, label: str, total: int, start: int) -> Iterator[Any]:
         """Show a bar with time left; yields `update(step, note)`."""
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -1,14 +1,19 @@
 """A search within a time: what there is no time for is left out, and said."""
 
+from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from test_selection import Table
 
 from simpel_cli.config.build import build
 from simpel_cli.discovery.search.budget import Budget, seconds_of
 from simpel_cli.discovery.search.sets.forward import select
+from simpel_cli.discovery.watch import Watch
 from simpel_cli.errors import ConfigError
+from simpel_cli.runs.console import Terminal
 
 
 @pytest.mark.parametrize(
@@ -51,3 +56,28 @@ def test_the_first_effect_is_found_in_any_case() -> None:
     assert [hurried.terms[t].effect for t in found.chosen.terms] == ["A"]
     assert "effects beside those found" in hurried.budget.left_out
     assert found.stages[-1].before.terms == ()
+
+
+def test_what_goes_on_is_said_with_the_time_and_none_is_guessed() -> None:
+    now = [0.0]
+    watch = Watch(Budget(None, lambda: now[0]))
+    assert str(watch).strip() == "0:00 min so far"
+    now[0] = 75.9
+    watch(12, 76)
+    assert str(watch).strip() == "12 of 76 fits · 1:15 min so far"
+    watch = Watch(Budget(90.0, lambda: now[0]))
+    now[0] += 60.0
+    assert str(watch).strip() == "1:00 min so far · 0:30 min left"
+    now[0] += 60.0
+    assert str(watch).strip() == "2:00 min so far · 0:00 min left"
+
+
+def test_a_line_below_the_others_is_drawn_where_somebody_looks(tmp_path: Path) -> None:
+    for looks in (True, False):
+        terminal, shown = Terminal(False, tmp_path / "run.log"), StringIO()
+        terminal.console = Console(file=shown, force_terminal=looks)
+        with terminal.working(lambda: "3 of 8 fits"):
+            terminal.line("calibrated", "search")
+        assert ("3 of 8 fits" in shown.getvalue()) == looks
+        assert "calibrated" in shown.getvalue()
+    assert "fits" not in (tmp_path / "run.log").read_text()

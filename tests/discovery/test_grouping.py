@@ -19,6 +19,7 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.memories import Memory
 from simpel_cli.discovery.searched import Again, Searched
+from simpel_cli.discovery.watch import Watch
 from simpel_cli.errors import ConfigError
 from simpel_cli.studies.declared import Declared
 from simulators.effects import Expression
@@ -95,8 +96,9 @@ def test_a_state_that_nobody_measures_is_asked_when_groups_are_known(
     answers = iter([first, first._replace(groupings=[], again=None)])
     monkeypatch.setattr(whole, "_search", lambda *_: next(answers))
     monkeypatch.setattr(whole, "confirmed", lambda groupings, *_: groupings)
+    monkeypatch.setattr(whole, "chosen_of", lambda *_: None)
     terminal: Any = SimpleNamespace(line=lambda *_: None)
-    ground = Ground(nothing, nothing, nothing, (), terminal, Budget())
+    ground = Ground(nothing, nothing, nothing, (), terminal, Budget(), Watch(Budget()))
     found = whole._search_in_groups(ground, [drag])
     if pays:
         assert isinstance(found, Searched)

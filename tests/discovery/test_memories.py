@@ -14,8 +14,8 @@ from command_line import TINY, simpel
 from scipy.integrate import solve_ivp
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery import searched as searched_module
-from simpel_cli.discovery.search.again import Earlier, beside
+from simpel_cli.discovery.search import again as again_module
+from simpel_cli.discovery.search.again import Earlier, asked_again, beside
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, worth_a_search
@@ -223,9 +223,9 @@ def test_a_search_is_made_again_only_for_a_state_that_earns_what_it_promises(
     none: Any = None
     earlier, attach = Earlier(none, none), lambda **_: none
     for outcome in (None, earlier._replace(heavy=True)):
-        monkeypatch.setattr(searched_module, "beside", lambda *_, found=outcome: found)
-        again = unwrap(searched_module._asked_for)(earlier, memory, True, attach, options, terminal)
+        monkeypatch.setattr(again_module, "beside", lambda *_, found=outcome: found)
+        again = unwrap(asked_again)(earlier, memory, True, attach, options, terminal)
         assert (again and again.earlier) == outcome
     assert "earns less than it has to" in (tmp_path / "run.log").read_text()
     # in place of what was chosen there is nothing to ask it beside
-    assert unwrap(searched_module._asked_for)(earlier, memory, False, attach, options, terminal).earlier is None
+    assert unwrap(asked_again)(earlier, memory, False, attach, options, terminal).earlier is None

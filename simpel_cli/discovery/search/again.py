@@ -3,11 +3,14 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, carried_windows, fitted_again, small_search
 from simpel_cli.discovery.search.trials import Search, Trial, asked
+from simpel_cli.discovery.search.unexplained.memories import Memory
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of, members
-from simulators.effects import Term
+from simpel_cli.runs.console import Terminal
+from simulators.effects import Expression, Term
 
 
 class Earlier(NamedTuple):
@@ -67,3 +70,30 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
         return None
     gain = stage.trials[0].optimum.log_evidence - before.optimum.log_evidence
     return earlier._replace(search=small, chosen=stage.trials[0]) if gain > asked(len(chosen.terms) + 1) else None
+
+
+class Again(NamedTuple):
+    """Effects with a state of their own, with which a search is worth making again.
+
+    Args:
+        memory: they.
+        earlier: what was chosen, beside which they promise; None: they do in its place.
+        effects: with those that differ from group to group; None: as they were given.
+    """
+
+    memory: Memory
+    earlier: Earlier | None
+    effects: list[Expression] | None = None
+
+
+def asked_again(
+    earlier: Earlier, memory: Memory, chosen_too: bool, attach: Callable[..., Setup], options: Discovery, terminal: Terminal
+) -> Again | None:  # fmt: skip
+    """Return the search with effects that have a state of their own, where one of them earns what it promises to."""
+    if not chosen_too:
+        return Again(memory, None)
+    found = beside(earlier, attach, memory.terms, options.lanes)
+    if found is None:
+        terminal.line(f"{memory.label} promises +{memory.gain:.0f}, and earns less than it has to", "memory")
+        return None
+    return Again(memory, found)

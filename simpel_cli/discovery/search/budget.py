@@ -37,9 +37,14 @@ class Budget:
         self.clock, self.began, self.seconds = clock, clock(), seconds
         self.left_out: list[str] = []
 
+    @property
+    def spent(self) -> float:
+        """Time since the search began, s."""
+        return self.clock() - self.began
+
     def over(self, what: str) -> bool:
         """Whether there is no time left for a part of the search, which is then left out."""
-        if self.seconds is None or self.clock() - self.began < self.seconds:
+        if self.seconds is None or self.spent < self.seconds:
             return False
         if what not in self.left_out:
             self.left_out.append(what)

@@ -91,6 +91,7 @@ class Optimum(NamedTuple):
         return float(0.5 * np.sum((axes.T @ g[inward]) ** 2 / (np.maximum(values, 0.0) + LEAST_CURVATURE)))
 
 
+Watch = Callable[[int, int], None]
 Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which of them are worth going on with
 
 
@@ -116,8 +117,11 @@ class Fitter:
     """Fits hypotheses; one compiled program for a batch of `side_by_side`, with up to `width` free unknowns each.
 
     Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
-    those that wait, always in the same order: a result does not depend on the number of threads.
+    those that wait, always in the same order: a result does not depend on the number of threads. `watch` is told after every
+    round how many have ended, of how many.
     """
+
+    watch: Watch | None = None
 
     def __init__(
         self, rule: Filter, coordinates: Coordinates, windows: Windows, *, side_by_side: int = 4, width: int = 16
@@ -135,6 +139,8 @@ class Fitter:
         state = self._begin(hypotheses)
         waiting, left = np.arange(len(hypotheses)), np.zeros(len(hypotheses), bool)
         while waiting.size:
+            if self.watch is not None:
+                self.watch(len(hypotheses) - len(waiting), len(hypotheses))
             before = state.loss[waiting]
             chunks = [waiting[i : i + self.side_by_side] for i in range(0, len(waiting), self.side_by_side)]
             for chunk, ended in zip(
