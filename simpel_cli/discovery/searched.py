@@ -16,7 +16,7 @@ from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prep
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
-from simpel_cli.discovery.search.sets.selection import Selection, cut
+from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
 from simpel_cli.discovery.search.smaller import fitter_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
@@ -222,12 +222,12 @@ def _chosen_in(
     def wrong(selection: Selection) -> Wider | _Heavy | None:
         if (ends := wider(found.search, selection.chosen)) is not None:
             return ends._replace(earlier=chosen_of(found, selection))
-        # beside what is left unexplained, no data tell whether tails are heavy
-        heavy = None if selection.remainder else _heavy(found, assessor, selection.chosen, ground)
+        heavy = None if beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
         return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
 
-    if earlier is not None and earlier.heavy and (path := path_in(found.search, found.base, earlier)):
-        found = _heavy(found, assessor, path[-1], ground) or found
+    if earlier is not None and earlier.heavy:
+        path = path_in(found.search, found.base, earlier)
+        found = _with_tails(found, assessor, path[-1] if path else found.base, ground) or found
     while True:
         selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
         outcome = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP, wrong)
@@ -238,10 +238,14 @@ def _chosen_in(
         found, earlier = outcome
 
 
-def _heavy(found: Calibrated, assessor: Assessor, trial: Trial, ground: Ground) -> Calibrated | None:
+def _heavy(found: Calibrated, assessor: Assessor, selection: Selection, ground: Ground) -> Calibrated | None:
     """Return the calibration with heavy tails where the noise has them beside a model, and is not known to; else None."""
-    if found.degrees_of_freedom or ground.budget.over("heavy tails of the noise"):
-        return None
+    # beside what is left unexplained, no data tell whether tails are heavy
+    skip = found.degrees_of_freedom or selection.remainder or ground.budget.over("heavy tails of the noise")
+    return None if skip else _with_tails(found, assessor, selection.chosen, ground)
+
+
+def _with_tails(found: Calibrated, assessor: Assessor, trial: Trial, ground: Ground) -> Calibrated | None:
     heavy = with_heavy_tails(found, assessor, trial.optimum.z, ground.terminal)
     if heavy is not None:
         heavy.search.budget = ground.budget
@@ -318,17 +322,24 @@ def _with(
         if per_of(beside) != per_of(own):
             return beside, chosen_of(found, selection)
         own = beside  # what it is worth beside the effects
-    judged = selection.chosen.terms
-    selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
-    if selection.chosen.terms != judged and (ends := wider(found.search, selection.chosen)) is not None:
-        return ends._replace(earlier=chosen_of(found, selection))
+    while True:
+        judged = selection.chosen.terms
+        selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
+        if selection.chosen.terms != judged and (ends := wider(found.search, selection.chosen)) is not None:
+            return ends._replace(earlier=chosen_of(found, selection))
+        heavy = _heavy(found, assessor, selection, ground)  # which rivals may have been needed to tell
+        if heavy is None:
+            break
+        outcome = _chosen_in(heavy, assessor, ground, wider, chosen_of(found, selection))
+        if isinstance(outcome, Wider):
+            return outcome
+        found, selection, gates = outcome
     search, windows = found.search, found.test
     by_simulations = None
     simulate = options.simulations
-    if (
-        simulate is None and options.for_ == FREE_RUN and not model.groups
-    ):  # beside groups it finds what differs among them
-        simulate = worth_simulating(search, assessor, selection)
+    if simulate is None:  # beside groups it would take for effects what differs from one to another
+        asks = options.for_ == FREE_RUN and not model.groups
+        simulate = asks and worth_simulating(search, assessor, selection)
     if simulate and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
@@ -336,7 +347,7 @@ def _with(
         by_simulations = chosen_by_simulations(search, selection, simulated, ahead, options, terminal)
         if by_simulations is not None:
             if (ends := wider(simulated, by_simulations[0].chosen)) is not None:
-                return ends
+                return ends._replace(earlier=chosen_of(found, selection))
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")

@@ -16,17 +16,18 @@ class Watch:
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
-        self.ended, self.fits = 0, 0
+        self.fits = 0, 0
 
     def __call__(self, ended: int, fits: int) -> None:
         """Take note of how many fits of a step have ended, of how many."""
-        self.ended, self.fits = ended, fits
+        self.fits = ended, fits
 
     def __str__(self) -> str:
         spent = self.budget.spent
         left = "" if self.budget.seconds is None else f" · {_minutes(max(self.budget.seconds - spent, 0.0))} left"
-        fits = f"{self.ended} of {self.fits} fits · " if self.fits else ""
-        return f"{'':<10}{fits}{_minutes(spent)} so far{left}"
+        ended, fits = self.fits  # at once: another thread draws
+        step = f"{ended} of {fits} fits · " if fits else ""
+        return f"{'':<10}{step}{_minutes(spent)} so far{left}"
 
 
 def _minutes(seconds: float) -> str:

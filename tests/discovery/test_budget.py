@@ -65,6 +65,8 @@ def test_what_goes_on_is_said_with_the_time_and_none_is_guessed() -> None:
     now[0] = 75.9
     watch(12, 76)
     assert str(watch).strip() == "12 of 76 fits · 1:15 min so far"
+    watch(0, 0)
+    assert str(watch).strip() == "1:15 min so far"
     watch = Watch(Budget(90.0, lambda: now[0]))
     now[0] += 60.0
     assert str(watch).strip() == "1:00 min so far · 0:30 min left"
@@ -75,7 +77,7 @@ def test_what_goes_on_is_said_with_the_time_and_none_is_guessed() -> None:
 def test_a_line_below_the_others_is_drawn_where_somebody_looks(tmp_path: Path) -> None:
     for looks in (True, False):
         terminal, shown = Terminal(False, tmp_path / "run.log"), StringIO()
-        terminal.console = Console(file=shown, force_terminal=looks)
+        terminal.console = Console(file=shown, force_terminal=looks, _environ={"TERM": "xterm"})
         with terminal.working(lambda: "3 of 8 fits"):
             terminal.line("calibrated", "search")
         assert ("3 of 8 fits" in shown.getvalue()) == looks

@@ -4,6 +4,7 @@ import json
 from functools import partial
 from inspect import unwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from scipy.integrate import solve_ivp
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search import again as again_module
-from simpel_cli.discovery.search.again import Earlier, asked_again, beside
+from simpel_cli.discovery.search.again import Again, Earlier, asked_again, beside
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, worth_a_search
 from simpel_cli.filtering.likelihood.augmented import augment
 from simpel_cli.filtering.likelihood.fit import Fitter
@@ -200,6 +201,9 @@ def test_a_state_of_its_own_is_asked_beside_what_was_chosen_before_a_search_begi
     model = heater()
     attach = partial(setup, model, data, (), [], 1)
     plan = attach(kept=frozenset())
+    # what the search knows of its windows: values that count less, and where they begin
+    ok, start = 0.9 * plan.windows.ok, plan.windows.start + 0.01
+    plan = plan._replace(windows=plan.windows._replace(ok=ok, start=start))
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=6))
     earlier = Earlier(search, search.base(), heavy=True)
     (term,) = wall().attach(model, plan.scales, ("T",))
@@ -211,21 +215,32 @@ def test_a_state_of_its_own_is_asked_beside_what_was_chosen_before_a_search_begi
     assert found.heavy
     assert [found.search.terms[t].effect for t in found.chosen.terms] == ["wall"]
     # beside the same measurements, each as far as it counts
-    assert np.array_equal(found.search.plan.windows.ok, search.plan.windows.ok)
+    assert np.array_equal(found.search.plan.windows.ok, ok)
     assert found.search.plan.windows.start.shape[1] == 2
-    assert np.array_equal(found.search.plan.windows.start[:, 0], search.plan.windows.start[:, 0])
+    assert np.array_equal(found.search.plan.windows.start[:, 0], start[:, 0])
 
 
-def test_a_search_is_made_again_only_for_a_state_that_earns_what_it_promises(
+def test_a_search_is_made_again_only_for_a_state_that_earns_its_place_and_has_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    memory, options, terminal = Memory((), 39.0), Discovery(), Terminal(False, tmp_path / "run.log")
+    memory, options, terminal = Memory((), 39.0), Discovery(room=3), Terminal(False, tmp_path / "run.log")
     none: Any = None
-    earlier, attach = Earlier(none, none), lambda **_: none
-    for outcome in (None, earlier._replace(heavy=True)):
-        monkeypatch.setattr(again_module, "beside", lambda *_, found=outcome: found)
-        again = unwrap(asked_again)(earlier, memory, True, attach, options, terminal)
-        assert (again and again.earlier) == outcome
+    attach = lambda **_: none  # noqa: E731
+    small: Any = SimpleNamespace(free=lambda terms: range(4 + 2 * len(terms)), plan=None)
+    chosen = lambda count: Trial(tuple(range(count)), none)  # noqa: E731
+    asked = unwrap(asked_again)
+    monkeypatch.setattr(again_module, "members", lambda _: 1)
+
+    def outcome(before: int, found: Earlier | None) -> Any:
+        monkeypatch.setattr(again_module, "beside", lambda *_: found)
+        return asked(Earlier(none, chosen(before)), memory, True, attach, options, terminal)
+
+    assert outcome(1, None) is None
     assert "earns less than it has to" in (tmp_path / "run.log").read_text()
+    found = Earlier(small, chosen(2), heavy=True)
+    assert outcome(1, found) == Again(memory, found)
+    assert outcome(0, found) == Again(memory, None)  # beside nothing it is one beginning of many
+    assert outcome(2, Earlier(small, chosen(3))) is None
+    assert "discovery.room=6" in (tmp_path / "run.log").read_text()
     # in place of what was chosen there is nothing to ask it beside
-    assert unwrap(asked_again)(earlier, memory, False, attach, options, terminal).earlier is None
+    assert asked(Earlier(none, chosen(1)), memory, False, attach, options, terminal) == Again(memory, None)

@@ -22,11 +22,12 @@ from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward
-from simpel_cli.discovery.search.sets.forward import further, select
+from simpel_cli.discovery.search.sets import selection as selection_module
+from simpel_cli.discovery.search.sets.forward import MOST_MERGERS, further, select
 from simpel_cli.discovery.search.sets.merging import _through, merged
 from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
-from simpel_cli.discovery.search.sets.selection import Selection, cut
-from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Trial, asked
+from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
+from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Stage, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
@@ -537,6 +538,53 @@ def test_a_late_signal_stands_for_two_signals_on_their_channels_or_before_them()
     assert not through(search, 0, (1, 4))  # and a force is no signal
 
 
+def test_what_stands_for_two_is_asked_about_before_it_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its ranges are not known yet."""
+    two, one, asked_of, judged_of = chosen_so("two", 2), chosen_so("one", 1), list[Any](), list[Any]()
+
+    def ask(selection: Any) -> str | None:
+        asked_of.append(selection.chosen.optimum)
+        return "wider" if selection is one else None
+
+    monkeypatch.setattr(acceptance, "condensed", lambda *_: one)
+    monkeypatch.setattr(acceptance, "gated_selection", lambda *_: judged_of.append(1))
+    none: Any = None
+    search: Any = SimpleNamespace(budget=Budget())
+    assert unwrap(judgement)(search, none, two, none, ask=ask) == "wider"
+    assert asked_of == ["two", "one"]
+    assert not judged_of
+
+
+@pytest.mark.parametrize("named", [0, MOST_MERGERS])
+def test_a_function_in_place_of_two_is_kept_in_mind_after_mergers(named: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    optimum: Any = SimpleNamespace(log_evidence=0.0)
+    function = Trial((9,), optimum)
+    merger = Stage(function, (Trial((0,), optimum),))
+    found = iter([*[merger] * named, Stage(function, (function,))])
+    monkeypatch.setattr(forward, "merged", lambda *_: next(found))
+    monkeypatch.setattr(forward, "nameless", lambda _, trial: trial is function)
+    monkeypatch.setattr(forward, "path_of", lambda *_: ())
+    monkeypatch.setattr(forward, "_grow", lambda *_: SimpleNamespace(stages=(), _replace=lambda **_: None))
+    monkeypatch.setattr(forward, "_ended", lambda *_: chosen_so("two", 2))
+    search: Any = SimpleNamespace(report=lambda _: None, terms=[SimpleNamespace(label="one")])
+    assert unwrap(forward.condensed)(search, chosen_so("two", 2)).instead is function
+
+
+@pytest.mark.parametrize(("function", "ahead"), [(20.0, True), (14.0, False), (None, False)])
+def test_a_function_that_did_better_than_a_step_took_is_known(
+    function: float | None, ahead: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = lambda value: SimpleNamespace(log_evidence=value)  # noqa: E731
+    monkeypatch.setattr(selection_module, "nameless", lambda _, trial: trial.terms[-1] == 1)
+    search: Any = None
+    base: Any = Trial((), at(0.0))
+    taken: Any = Trial((0,), at(12.0))
+    others: tuple[Any, ...] = () if function is None else (Trial((1,), at(function)),)
+    last: Any = Trial((0, 1), at(99.0))  # what is still asked for after the last step is `remainder`
+    found = Selection(base, taken, (base, taken), (), (Stage(base, (taken, *others)), Stage(taken, (last,))), (), None)
+    assert unwrap(beaten)(search, found) == ahead
+
+
 def test_noise_that_was_heavy_is_so_from_the_beginning_of_the_next_search(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = chosen_so("chosen", 1)
     gaussian, heavy = in_noise("gaussian", {}), in_noise("heavy", {"y": 3.0})
@@ -561,6 +609,7 @@ def test_noise_that_was_heavy_is_so_from_the_beginning_of_the_next_search(monkey
     ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None, budget=Budget())
     unchecked(monkeypatch)
     monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
+    monkeypatch.setattr(searched_module, "_with_tails", unwrap(searched_module._with_tails))
     found, _, _ = unwrap(_chosen_in)(gaussian, none, ground, lambda *_: None, Earlier(none, none, heavy=True))
     assert found is heavy
     assert (asked, searches) == (["earlier"], ["heavy"])
@@ -595,6 +644,7 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let fakes through."""
     monkeypatch.setattr(searched_module, "judgement", unwrap(judgement))
     monkeypatch.setattr(searched_module, "chosen_of", unwrap(searched_module.chosen_of))
+    monkeypatch.setattr(searched_module, "beaten", lambda *_: False)
 
 
 @pytest.mark.parametrize(
@@ -618,8 +668,8 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
     monkeypatch.setattr(searched_module, "proposed", lambda *_, **__: proposal)
     monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)
     monkeypatch.setattr(acceptance, "gated_selection", judge)
-    monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
     unchecked(monkeypatch)
+    monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
     none: Any = None
     found = Calibrated(none, none, none, none, {"y": 3.0})
     ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
@@ -649,8 +699,8 @@ def test_what_is_judged_last_has_the_noise_that_its_own_residuals_show(
         judgements.append((search.name, selection.chosen.optimum))
         return kept, [], []
 
-    def tails(found: Any, _: Any, trial: Any, __: Any) -> Any:
-        return heavy if found is gaussian and trial.optimum == shown_by else None
+    def tails(found: Any, _: Any, selection: Any, __: Any) -> Any:
+        return heavy if found is gaussian and selection.chosen.optimum == shown_by else None
 
     monkeypatch.setattr(searched_module, "proposed", propose)
     monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)

@@ -1,5 +1,7 @@
 """A search by simulations: what it finds, and how that is said in the coordinates of the ordinary search."""
 
+from inspect import unwrap
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -121,3 +123,19 @@ def test_what_explains_most_of_a_free_run_asks_for_no_simulations() -> None:
     assert found.chosen.terms
     assert not worth_simulating(search, assessor, found)
     assert worth_simulating(search, assessor, found._replace(chosen=found.base))  # nothing is gone
+
+
+def test_a_model_that_runs_away_asks_for_simulations() -> None:
+    """Rows in which it has no error are no rows without one."""
+    base: Any = SimpleNamespace(optimum=SimpleNamespace(z=np.zeros(2)))
+    lost: Any = SimpleNamespace(optimum=SimpleNamespace(z=np.ones(2)))
+    free = np.ones((3, 5, 1))
+    away = np.where(np.arange(3)[:, None, None] == 0, np.nan, 1e-3 * free)
+    errors = {0.0: free, 1.0: away}
+    coordinates = SimpleNamespace(sizes=(1, 1, 0), value=lambda *_: 0.01)
+    search: Any = SimpleNamespace(plan=SimpleNamespace(coordinates=coordinates, windows=None))
+    assessor: Any = lambda z, _: SimpleNamespace(free=errors[float(z[0])])  # noqa: E731
+    selection: Any = SimpleNamespace(base=base, chosen=lost)
+    assert unwrap(worth_simulating)(search, assessor, selection)
+    errors[1.0] = 1e-3 * free
+    assert not unwrap(worth_simulating)(search, assessor, selection)

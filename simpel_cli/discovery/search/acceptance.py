@@ -71,7 +71,9 @@ def judgement(
     while True:
         if (answer := ask(selection)) is not None:
             return answer
-        selection = condensed(search, selection)
+        before, selection = selection.chosen.terms, condensed(search, selection)
+        if selection.chosen.terms != before and (answer := ask(selection)) is not None:
+            return answer
         proposal = selection.chosen.terms
         selection, found, harmful = gated_selection(search, assessor, selection, terminal, use)
         search_on -= 1

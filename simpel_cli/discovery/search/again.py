@@ -38,7 +38,9 @@ def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
     place = {key_of(term): t for t, term in enumerate(search.terms)}
     keys = [key_of(earlier.search.terms[t]) for t in earlier.chosen.terms]
     terms = tuple(place[key] for key in keys if key in place and place[key] not in search.banned)
-    if not terms or not search.fits(terms):
+    while not search.fits(terms):  # another program may have had more room
+        terms = terms[:-1]
+    if not terms:
         return ()
     z = search.loud(carried(earlier.search.plan, earlier.chosen.optimum.z, search.plan))
     sets = [terms[: k + 1] for k in range(len(terms))]
@@ -68,8 +70,10 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
     stage = small.add(before, [t for t, term in enumerate(small.terms) if key_of(term) in keys])
     if not stage.trials:
         return None
-    gain = stage.trials[0].optimum.log_evidence - before.optimum.log_evidence
-    return earlier._replace(search=small, chosen=stage.trials[0]) if gain > asked(len(chosen.terms) + 1) else None
+    best = stage.trials[0]
+    before = small.best(before.terms, small.fitter(small.less(best, before.terms)))  # it may have led there
+    gain = best.optimum.log_evidence - before.optimum.log_evidence
+    return earlier._replace(search=small, chosen=best) if gain > asked(len(chosen.terms) + 1) else None
 
 
 class Again(NamedTuple):
@@ -89,11 +93,16 @@ class Again(NamedTuple):
 def asked_again(
     earlier: Earlier, memory: Memory, chosen_too: bool, attach: Callable[..., Setup], options: Discovery, terminal: Terminal
 ) -> Again | None:  # fmt: skip
-    """Return the search with effects that have a state of their own, where one of them earns what it promises to."""
+    """Return the search with effects that have a state of their own, where one of them earns what an effect has to."""
     if not chosen_too:
         return Again(memory, None)
     found = beside(earlier, attach, memory.terms, options.lanes)
+    promise = f"{memory.label} promises +{memory.gain:.0f}"
     if found is None:
-        terminal.line(f"{memory.label} promises +{memory.gain:.0f}, and earns less than it has to", "memory")
+        terminal.line(f"{promise}, and earns less than it has to", "memory")
         return None
-    return Again(memory, found)
+    unknowns = len(found.search.free(found.chosen.terms)) - len(found.search.free(()))
+    if unknowns > options.room + members(found.search.plan):
+        terminal.line(f"{promise}: no room beside what was chosen (discovery.room={unknowns})", "memory")
+        return None
+    return Again(memory, found if earlier.chosen.terms else None)  # alone it is one beginning of many

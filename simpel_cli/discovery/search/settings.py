@@ -31,7 +31,7 @@ class Discovery:
         simulations: whether a second search takes every episode for one simulation, whose remainder has a memory; what it
             finds is chosen where it is worth more. It takes as long again, and may take what differs from group to group for
             effects. Null: where the model is for `free_run`, no column names groups, and what was found leaves a fifth of the
-            error of a free run, of any quantity.
+            mean square error of a free run, of any quantity.
         determine: whether an experiment is designed that determines what the data leave open of the simulator's parameters.
         budget: how long the search may take, s (60, `60s`, `2min`): what is worth most comes first, and the verdict says what
             was left out. What has begun is ended, and the report comes on top. Null: as long as it takes.

@@ -37,7 +37,7 @@ class Explained(NamedTuple):
 
 
 def shares(before: np.ndarray, after: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return which share of the mean square error beyond the noise is gone, (ny,); nan: none was, or that is not known."""
+    """Return the share of the mean square error beyond the noise that is gone, (ny,); nan: none was, or it is not known."""
     beyond = np.isfinite(before) & np.isfinite(after) & (noise > 0) & (before > NEAR * noise)
     first, second = (np.maximum(e**2 - noise**2, 0.0) for e in (before, after))
     return np.where(beyond, 1 - second / np.where(beyond, first, 1.0), np.nan)

@@ -17,7 +17,7 @@ from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.share import shares
 from simpel_cli.discovery.search.smaller import carried, carried_windows, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
-from simpel_cli.filtering.errors_ahead import Assessor, rmse
+from simpel_cli.filtering.errors_ahead import Assessor, rmse, with_lost
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
@@ -26,14 +26,18 @@ NEARLY_ALL = 0.8  # of the mean square error of a free run beyond the noise: bes
 
 
 def worth_simulating(found: Search, assessor: Assessor, selection: Selection) -> bool:
-    """Whether what an ordinary search has found leaves much of the error of a free run, of any quantity."""
+    """Whether what an ordinary search has found leaves much of the error of a free run, of any quantity.
+
+    Where one of the two models runs away, its error is large; where both do, nothing is known.
+    """
     plan = found.plan
     n_p, n_r, _ = plan.coordinates.sizes
     z = selection.chosen.optimum.z
     noise = np.array([plan.coordinates.value(i, float(z[i])) for i in range(n_p, n_p + n_r)])
-    before, after = (rmse(assessor(trial.optimum.z, plan.windows).free) for trial in (selection.base, selection.chosen))
-    gone = shares(before, after, noise)
-    return bool(np.any(gone < NEARLY_ALL))
+    before, after = with_lost(
+        *(assessor(trial.optimum.z, plan.windows).free for trial in (selection.base, selection.chosen))
+    )
+    return bool(np.any(shares(rmse(before), rmse(after), noise) < NEARLY_ALL))
 
 
 def simulating(found: Search, base: Trial, attach: Callable[..., Setup], fitter: Callable[[Setup], Fitter]) -> Search:

@@ -117,8 +117,8 @@ class Fitter:
     """Fits hypotheses; one compiled program for a batch of `side_by_side`, with up to `width` free unknowns each.
 
     Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
-    those that wait, always in the same order: a result does not depend on the number of threads. `watch` is told after every
-    round how many have ended, of how many.
+    those that wait, always in the same order: a result does not depend on the number of threads. `watch` is told before every
+    round how many have ended, of how many, and 0 of 0 in the end.
     """
 
     watch: Watch | None = None
@@ -157,6 +157,8 @@ class Fitter:
                 hopeful = hopes(self._optima(state, hypotheses))
                 left[waiting] = [not hopeful[i] for i in waiting]
                 waiting = waiting[~left[waiting]]
+        if self.watch is not None:
+            self.watch(0, 0)
         return [o._replace(left=bool(gone)) for o, gone in zip(self._optima(state, hypotheses), left, strict=True)]
 
     def _optima(self, state: Course, hypotheses: Sequence[Hypothesis]) -> list[Optimum]:

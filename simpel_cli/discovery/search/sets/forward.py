@@ -109,15 +109,17 @@ def _paired(search: Search, grown: _Grown) -> _Grown:
 def condensed(search: Search, found: Selection) -> Selection:
     """Put one term in the place of two chosen ones where one will do, and go on from there.
 
-    With many effects it takes longer than what came before: it is asked of what is known to be in the right ranges.
+    With many effects it takes longer than what came before: it is asked once it is known that the ranges are right.
     """
     for merger in range(MOST_MERGERS + 1):
         stage = merged(search, found.chosen)
-        if stage is None or merger == MOST_MERGERS:
+        if stage is None:
             break
         whole = stage.trials[0]
         if nameless(search, whole):
             return found._replace(instead=whole)
+        if merger == MOST_MERGERS:
+            break
         search.report(f"{search.terms[whole.terms[-1]].label} in place of two")
         again = _grow(search, path_of(search, whole))
         found = _ended(search, again._replace(stages=(*found.stages, stage, *again.stages)))

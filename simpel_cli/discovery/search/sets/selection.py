@@ -3,6 +3,8 @@
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial, asked
 from simulators.effects import Term
 
@@ -39,6 +41,21 @@ def worth(trial: Trial) -> float:
 def nameless(search: Search, trial: Trial) -> bool:
     """Whether the newest term of a trial is a function without a name."""
     return bool(search.terms[trial.terms[-1]].depends_on)
+
+
+def beaten(search: Search, found: Selection) -> bool:
+    """Whether a function without a name did better than the named effect that a step of the search took."""
+    chosen = set(found.chosen.terms)
+    for stage in found.stages:
+        evidence = {
+            unnamed: max(
+                (t.optimum.log_evidence for t in stage.trials if nameless(search, t) == unnamed), default=-np.inf
+            )
+            for unnamed in (True, False)
+        }
+        if chosen > set(stage.before.terms) and evidence[True] >= evidence[False] + ACCEPT:
+            return True
+    return False
 
 
 def path_of(search: Search, chosen: Trial) -> tuple[Trial, ...]:
