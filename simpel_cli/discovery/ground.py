@@ -32,6 +32,7 @@ class Ground(NamedTuple):
         watch: is told of fits.
         wider: how often ranges of the model or of effects were found too narrow.
         earlier: what was chosen before something else was known.
+        simulated: likewise by simulations.
         remembering: effects with a state of their own that the program has room for.
     """
 
@@ -44,6 +45,7 @@ class Ground(NamedTuple):
     watch: Watch
     wider: int = 0
     earlier: Earlier | None = None
+    simulated: Earlier | None = None
     remembering: tuple[Term, ...] = ()
 
     def attach(self, effects: list[Expression]) -> Callable[..., Setup]:

@@ -89,7 +89,11 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             known = {key_of(t) for t in ground.remembering}  # in their ranges, too
             terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
             ground = ground._replace(
-                model=model, wider=ground.wider + 1, earlier=found.earlier or ground.earlier, remembering=tuple(terms)
+                model=model,
+                wider=ground.wider + 1,
+                earlier=found.earlier or ground.earlier,
+                simulated=found.simulated or ground.simulated,
+                remembering=tuple(terms),
             )
         else:
             terminal.line(found.memory.words, "memory")
@@ -344,10 +348,12 @@ def _with(
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
         ahead = assessor.of(simulated.plan)
-        by_simulations = chosen_by_simulations(search, selection, simulated, ahead, options, terminal)
+        by_simulations = chosen_by_simulations(
+            search, selection, simulated, ahead, options, terminal, wider, ground.simulated
+        )
+        if isinstance(by_simulations, Wider):
+            return by_simulations._replace(earlier=chosen_of(found, selection))
         if by_simulations is not None:
-            if (ends := wider(simulated, by_simulations[0].chosen)) is not None:
-                return ends._replace(earlier=chosen_of(found, selection))
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")

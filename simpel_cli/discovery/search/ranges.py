@@ -36,11 +36,13 @@ class Wider(NamedTuple):
         ranges: by the names of their parameters.
         gain: nats of evidence.
         earlier: what was chosen without them.
+        simulated: likewise by simulations, where these ask for them.
     """
 
     ranges: dict[str, Range]
     gain: float
     earlier: Earlier | None = None
+    simulated: Earlier | None = None
 
 
 def too_narrow(search: Search, trial: Trial) -> Wider | None:

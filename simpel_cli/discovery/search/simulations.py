@@ -11,7 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
+from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.share import shares
@@ -66,9 +68,12 @@ def _begun(old: Setup, z: np.ndarray, plan: Setup) -> np.ndarray:
 
 
 def chosen_by_simulations(
-    found: Search, selection: Selection, simulated: Search, assessor: Assessor, options: Discovery, terminal: Terminal
-) -> tuple[Selection, list[Gate]] | None:
+    found: Search, selection: Selection, simulated: Search, assessor: Assessor, options: Discovery, terminal: Terminal,
+    wider: Callable[[Search, Trial], Wider | None] = lambda *_: None, earlier: Earlier | None = None,
+) -> tuple[Selection, list[Gate]] | Wider | None:  # fmt: skip
     """Return other effects that simulations ask for, with their gates; None: they ask for none that are worth more.
+
+    Where they ask for wider ranges first, these are returned.
 
     Args:
         found: the ordinary search.
@@ -77,6 +82,8 @@ def chosen_by_simulations(
         assessor: of its program.
         options: of the search.
         terminal: takes lines.
+        wider: whether ranges are too narrow for a model.
+        earlier: what a search by simulations has chosen in narrower ranges: this one may begin with that instead.
     """
     terminal.line("by simulations, whose remainders have a memory", "search")
     path = [simulated.base()]
@@ -85,10 +92,22 @@ def chosen_by_simulations(
             _begun(found.plan, trial.optimum.z, simulated.plan), simulated.free(trial.terms), simulated.ones
         )
         path.append(simulated.best(trial.terms, simulated.fitter([start])))
-    own = path[-1]
-    other = proposed(simulated, assessor, path[0], options, tuple(path))
-    other, gates = judgement(simulated, assessor, other, terminal)
-    other, gates = accepted(simulated, assessor, other, gates, terminal)
+    own, begun = path[-1], tuple(path)
+    known = path_in(simulated, path[0], earlier) if earlier is not None else ()
+    begun = max(begun, known or begun, key=lambda p: worth(p[-1]))
+
+    def ask(at: Selection) -> Wider | None:
+        ends = wider(simulated, at.chosen)
+        return ends and ends._replace(simulated=Earlier(simulated, at.chosen))
+
+    other = proposed(simulated, assessor, path[0], options, begun)
+    outcome = judgement(simulated, assessor, other, terminal, ask=ask)
+    if isinstance(outcome, Wider):
+        return outcome
+    judged, gates = outcome
+    other, gates = accepted(simulated, assessor, judged, gates, terminal)
+    if other.chosen.terms != judged.chosen.terms and (ends := ask(other)) is not None:
+        return ends
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")
