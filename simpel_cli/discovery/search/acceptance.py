@@ -44,7 +44,7 @@ def proposed(
         earlier: a search that this one is made after, which has tried other beginnings.
     """
     if earlier is not None and (path := path_in(search, base, earlier)):
-        return selected(search, base, 0, path)
+        return selected(search, base, 0, path, settled=earlier.settled)
     selection = selected(search, base, options.beginnings, begun)
     return widely(search, selection) if far(search, assessor, selection.chosen) else selection
 

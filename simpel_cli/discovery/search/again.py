@@ -20,11 +20,13 @@ class Earlier(NamedTuple):
         search: it.
         chosen: its model.
         heavy: whether the noise had heavy tails there.
+        settled: whether it was chosen in the same ranges and noise, so that only what stands beside it is asked.
     """
 
     search: Search
     chosen: Trial
     heavy: bool = False
+    settled: bool = False
 
 
 def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
@@ -42,6 +44,8 @@ def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
         terms = terms[:-1]
     if not terms:
         return ()
+    if earlier.settled:
+        search.together |= earlier.search.together
     z = search.loud(carried(earlier.search.plan, earlier.chosen.optimum.z, search.plan))
     sets = [terms[: k + 1] for k in range(len(terms))]
     starts = [Hypothesis(search.off(z, terms[k + 1 :]), search.free(here), search.ones) for k, here in enumerate(sets)]
@@ -73,7 +77,10 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
     best = stage.trials[0]
     before = small.best(before.terms, small.fitter(small.less(best, before.terms)))  # it may have led there
     gain = best.optimum.log_evidence - before.optimum.log_evidence
-    return earlier._replace(search=small, chosen=best) if gain > asked(len(chosen.terms) + 1) else None
+    if gain <= asked(len(chosen.terms) + 1):
+        return None
+    small.together = set(search.together)
+    return earlier._replace(search=small, chosen=best, settled=True)
 
 
 class Again(NamedTuple):

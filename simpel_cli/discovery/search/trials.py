@@ -15,7 +15,7 @@ from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.race import Race
-from simpel_cli.filtering.setup import Setup
+from simpel_cli.filtering.setup import Key, Setup
 from simpel_cli.filtering.two_optima import other_optima
 from simulators.groups import SPREAD, slot_names, spreads_of
 
@@ -35,7 +35,6 @@ QUIETER = 0.1  # of the range of log q, than at the very start
 ANYWHERE = 3  # starts of an effect anywhere in the ranges of its parameters
 STARTS = 6  # of the model as it is
 SPREADS = (0.03, 0.1, 0.35, 1.0)  # of groups, of their largest
-
 
 Answer = TypeVar("Answer")
 
@@ -103,6 +102,7 @@ class Search:
         self.budget = Budget()
         self.declared: dict[str, tuple[float, float]] = {}  # ranges of parameters that are wider here than was declared
         self.banned: set[int] = set()  # terms that are no candidates
+        self.together: set[frozenset[Key]] = set()  # pairs of terms for which no single one stands
         self.known: dict[frozenset[int], Optimum] = {}  # the best fit of every set of terms so far
         self._answers: dict[tuple[Any, ...], Any] = {}  # to what was asked already
 

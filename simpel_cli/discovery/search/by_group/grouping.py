@@ -116,7 +116,7 @@ def groupings(
         search: that was run.
         assessor: of errors ahead.
         selection: what it ended with.
-        unexplained: whether something is left that no effect explains; then those are asked, too, that were not accepted.
+        unexplained: whether those are asked, too, that were not accepted.
         effects: of the catalogue.
         attach: (effects, kept, extra) -> the setup of a program with these terms.
         options: of the search.

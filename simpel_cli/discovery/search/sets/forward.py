@@ -44,8 +44,9 @@ def select(
 
 
 def selected(
-    search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS, begun: tuple[Trial, ...] = ()
-) -> Selection:
+    search: Search, base: Trial | None = None, beginnings: int = BEGINNINGS, begun: tuple[Trial, ...] = (), *,
+    settled: bool = False,
+) -> Selection:  # fmt: skip
     """Search, from the calibrated simulator if it is known already; one effect in place of two is not asked yet, nor rivals.
 
     Args:
@@ -53,10 +54,11 @@ def selected(
         base: its calibrated simulator.
         beginnings: first effects that are tried beside the one that explains most, where one effect is not enough.
         begun: fits from the calibrated simulator to a set of effects that the search begins with, too.
+        settled: it begins with these alone.
     """
     base = base or search.base()
-    grown = _grow(search, (base,), leader=begun)
-    if len(begun) > 1:
+    grown = _grow(search, begun if settled else (base,), leader=() if settled else begun)
+    if len(begun) > 1 and not settled:
         search.report(f"beginning with {' and '.join(search.terms[t].label for t in begun[-1].terms)}")
         again = _grow(search, begun)
         again = again._replace(stages=(*grown.stages[:1], *again.stages))

@@ -9,6 +9,7 @@ from simpel_cli.discovery.search.sets.selection import nameless, worth
 from simpel_cli.discovery.search.trials import ACCEPT, SHARE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.race import MARGIN, hopeful
+from simpel_cli.filtering.setup import key_of
 from simulators.effects.term import INPUT, OPERATORS, SENSOR
 
 SLACK = 10.0  # nats by which the widths of priors may differ
@@ -23,11 +24,15 @@ def merged(search: Search, chosen: Trial) -> Stage | None:
     An input that arrives late makes two sensors seem late, and one function of the input two faults of it. None: there is
     no such term.
     """
-    pairs = list(combinations(chosen.terms, 2))
+    called = {pair: frozenset(key_of(search.terms[t]) for t in pair) for pair in combinations(chosen.terms, 2)}
+    pairs = [pair for pair, name in called.items() if name not in search.together]
     if not pairs or search.budget.over("one effect in place of two"):
         return None
     question = "merged", chosen.terms, chosen.optimum.z.tobytes(), frozenset(search.banned)
-    return search.once(question, lambda: _merged(search, chosen, pairs))
+    stage = search.once(question, lambda: _merged(search, chosen, pairs))
+    if stage is None:
+        search.together.update(called.values())
+    return stage
 
 
 def _merged(search: Search, chosen: Trial, pairs: list[tuple[int, int]]) -> Stage | None:
