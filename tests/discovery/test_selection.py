@@ -21,13 +21,13 @@ from simpel_cli.discovery.search.calibration import Calibrated, calibrated
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
-from simpel_cli.discovery.search.sets import forward
+from simpel_cli.discovery.search.sets import forward, merging
 from simpel_cli.discovery.search.sets import selection as selection_module
-from simpel_cli.discovery.search.sets.forward import MOST_MERGERS, further, select
+from simpel_cli.discovery.search.sets.forward import MOST_MERGERS, further, select, selected
 from simpel_cli.discovery.search.sets.merging import _through, merged
 from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
-from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Stage, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Search, Stage, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
@@ -203,6 +203,38 @@ def test_what_did_harm_takes_no_place_of_two() -> None:
     assert merged(search, chosen) is stage
     search.banned.add(terms["E"])
     assert merged(search, chosen) is None
+
+
+def test_two_for_which_nothing_stands_are_not_asked_about_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = {"": 0.0, "A": 20.0, "B": 15.0, "AB": 40.0, "ABD": 61.0}
+    table, later = Table(gains), Table(gains)
+    terms = {term.effect: t for t, term in enumerate(table.search.terms)}
+    asked_of = list[tuple[int, int]]()
+    monkeypatch.setattr(merging, "_alike", lambda _, __, pair: asked_of.append(pair) or [])
+
+    def merge(search: Search, names: str) -> set[str]:
+        asked_of.clear()
+        assert merged(search, search.part(search.base(), tuple(terms[name] for name in names))) is None
+        return {"".join(sorted(search.terms[t].effect for t in pair)) for pair in asked_of}
+
+    assert merge(table.search, "AB") == {"AB"}
+    assert merge(table.search, "ABD") == {"AD", "BD"}
+    # nor in a search that is made after it, in the same ranges and noise
+    chosen = table.search.part(table.search.base(), (terms["A"], terms["B"]))
+    for settled in (False, True):
+        path_in(later.search, later.search.base(), Earlier(table.search, chosen, settled=settled))
+        assert bool(later.search.together) == settled
+    assert merge(later.search, "ABD") == set()
+
+
+def test_a_search_begins_with_what_was_settled_alone() -> None:
+    search = Table({"": 0.0, "A": 30.0, "B": 20.0, "AB": 20.5}).search
+    base = search.base()
+    (b,) = (t for t, term in enumerate(search.terms) if term.effect == "B")
+    begun = (base, search.part(base, (b,)))
+    for settled, name in ((False, "A"), (True, "B")):
+        found = selected(search, base, 0, begun, settled=settled)
+        assert [search.terms[t].effect for t in found.chosen.terms] == [name]
 
 
 def test_one_effect_takes_the_place_of_two_where_it_explains_as_much() -> None:
