@@ -124,12 +124,15 @@ def gated_selection(
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
     member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps.
+    And where others fall with one that was not certain, they stay together if together they surely help beside what is left:
+    an overflow may do harm without the outflow that belongs to it.
     Where a use is named, harm is what is left of it with both models calibrated for that.
 
     Returns:
         what is left of the selection, its gates, and the terms with which an error grows.
     """
     harmful: list[int] = []
+    whole: tuple[Selection, list[Gate]] | None = None
     while selection.chosen.terms:
         chosen = selection.chosen
         parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
@@ -143,19 +146,28 @@ def gated_selection(
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
         if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
-            (whole,) = gates(search, assessor, chosen, [selection.base])
-            failed = [] if whole.passed else failed
+            (beside_none,) = gates(search, assessor, chosen, [selection.base])
+            failed = [] if beside_none.passed else failed
+        strong = all(not judged[i].harm and judged[i].gain > 0 and selection.gains[i] > STRONG for i in failed)
+        if whole is None and not harmful and failed and strong:
+            whole = selection, judged
         harm = [i for i in failed if judged[i].harm]
         gone = min(harm or failed, key=lambda i: judged[i].gain if harm else selection.gains[i], default=None)
         for i, (term, found) in enumerate(zip(chosen.terms, judged, strict=True)):
             _report_gate(search.terms[term].label, found, terminal, out=i == gone)
         if gone is None:
-            return selection, judged, harmful
+            break
         if judged[gone].harm:
             harmful.append(chosen.terms[gone])
             search.banned.add(chosen.terms[gone])  # nor is it another name for what stays
         selection = refused(search, selection, gone)
-    return selection, [], harmful
+    if whole is not None and len(selection.chosen.terms) < len(whole[0].chosen.terms) - 1:
+        (together,) = gates(search, assessor, whole[0].chosen, [selection.chosen])
+        _report_gate("all of these together", together, terminal, out=not together.passed)
+        if together.passed:
+            search.banned -= set(harmful)
+            return *whole, []
+    return selection, judged if selection.chosen.terms else [], harmful
 
 
 def _helps(judged: Gate, earned: float) -> bool:
