@@ -430,6 +430,37 @@ def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.Monk
     assert judged == []
 
 
+@pytest.mark.parametrize(("helps", "gain"), [(True, 5.0), (False, 5.0), (True, -5.0)])
+def test_effects_stay_together_that_fall_without_an_uncertain_one(
+    helps: bool, gain: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """An overflow does harm without the outflow that belongs to it, of which held-out parts are not certain."""
+    search: Any = Table({"": 0.0, "A": 60.0, "B": 70.0, "AB": 130.0}).search
+    found = select(search)
+    first, *_ = found.chosen.terms
+
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+        if len(whole.terms) == 2 and len(parts) == 1:
+            assert parts[0].terms == ()
+            return [Gate(30.0, 10.0 if helps else -10.0, 50.0, "episode", False, helps)]
+        gates = {search.terms[first].effect: Gate(gain, -9.0, 30.0, "episode", False, False)}
+        alone = len(whole.terms) == 1
+        sure = Gate(20.0, 5.0, 30.0, "episode", alone, not alone)
+        return [gates.get(search.terms[t].effect, sure) for t in whole.terms]
+
+    monkeypatch.setattr(acceptance, "gates", judge)
+    # the uncertain one is worth less by evidence, and goes first
+    search.banned, before = set(search.banned), set(search.banned)
+    assert search.terms[first].effect == "B"
+    kept, judged, harmful = gated_selection(
+        search, Assessor(search.plan, 5), found._replace(gains=(60.0, 70.0)), Terminal(True, tmp_path / "run.log")
+    )
+    stays = helps and gain > 0
+    assert len(kept.chosen.terms) == len(judged) == 2 * stays
+    assert bool(harmful) != stays
+    assert (search.banned == before) == stays
+
+
 def test_values_that_stand_out_where_nothing_is_fitted_are_left_out_too(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
