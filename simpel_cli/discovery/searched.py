@@ -382,9 +382,7 @@ def _with(
         terminal.line(f"{drift.words} +{drift.gain:.0f}", "search")
     if disturbance is not None:
         terminal.line(f"a force on {disturbance.acts_on} {disturbance.how} +{disturbance.gain:.0f}", "search")
-    # one value for all groups may make up for values of their own of something else
-    alike = not any(search.terms[t].groupings for t in selection.chosen.terms)
-    left = alike or bool(selection.remainder or disturbance or drift)
+    left = bool(selection.remainder or disturbance or drift)
     asked = own
     if not (model.groups and ground.budget.over("effects per group")):
         asked = own + groupings(search, assessor, selection, left, effects, attach_said, options, terminal)

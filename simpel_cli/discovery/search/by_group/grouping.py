@@ -116,7 +116,9 @@ def groupings(
         search: that was run.
         assessor: of errors ahead.
         selection: what it ended with.
-        unexplained: whether those are asked, too, that were not accepted.
+        unexplained: whether something is left that no effect explains; then those are asked, too, that were not accepted.
+            Where none of the accepted ones differs, others are asked in their place: one value for all may make up for what
+            differs from group to group of something else.
         effects: of the catalogue.
         attach: (effects, kept, extra) -> the setup of a program with these terms.
         options: of the search.
@@ -126,7 +128,11 @@ def groupings(
     if not columns:
         return []
     leaders = _leaders(search, selection) if unexplained or not chosen.terms else []
-    terms = [search.terms[t] for t in (*chosen.terms, *(t.terms[-1] for t in leaders))]
+    known = {search.terms[t].effect for t in (*chosen.terms, *(t.terms[-1] for t in leaders))}
+    differs = any(search.terms[t].groupings for t in chosen.terms)
+    alone = [] if differs or not chosen.terms else _leaders(search, selection._replace(chosen=selection.base))
+    instead = [t for t in alone if search.terms[t.terms[-1]].effect not in known]
+    terms = [search.terms[t] for t in (*chosen.terms, *(t.terms[-1] for t in (*leaders, *instead)))]
     alike = [
         e
         for e in effects
@@ -137,10 +143,14 @@ def groupings(
     terminal.line(f"does {' or '.join(e.name for e in alike)} differ by {' or '.join(columns)}", "groups")
     differing = {_name(e.name, by): replace(e, name=_name(e.name, by), per=by) for e in alike for by in columns}
     small, own = _small(search, chosen, terms, [*effects, *differing.values()], list(differing), attach, options)
-    first = {search.terms[t.terms[-1]].effect: t for t in leaders}
+    first = {search.terms[t.terms[-1]].effect: t for t in (*leaders, *instead)}
+    in_place = {search.terms[t.terms[-1]].effect for t in instead}
 
     def question(name: str, by: str) -> Question:
         def trials(at: Trial) -> tuple[Trial, list[Trial]]:
+            if name in in_place:
+                whole = _added(small, small.part(at, ()), search, first[name])
+                return _differing(small, whole, name, _name(name, by)), [at]
             whole = _added(small, at, search, first[name]) if name in first else at
             return _differing(small, whole, name, _name(name, by)), [at] if whole is at else [whole, at]
 
