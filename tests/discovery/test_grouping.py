@@ -1,6 +1,7 @@
 """Whether grouping pays, asked by a search itself of the columns that `data.groups` names, on planted groups."""
 
 import json
+from inspect import unwrap
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,6 +15,7 @@ from simpel_cli.data import Measurements
 from simpel_cli.discovery import searched as whole
 from simpel_cli.discovery.ground import Ground
 from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.by_group import grouping as grouping_module
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, sentence_of
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -180,3 +182,53 @@ def test_rivals_of_an_effect_that_only_differing_explains_differ_as_well() -> No
     ]
     assert [e.per for e in grouped_effects(effects, found)] == ["ball", "ball", ""]
     assert [e.per for e in grouped_effects(effects, [g._replace(accepted=True) for g in found])] == ["ball", "", ""]
+
+
+@pytest.mark.parametrize(("chosen", "differs"), [((0,), False), ((0,), True), ((), False)])
+def test_effects_that_differ_are_asked_in_place_of_one_that_does_not(
+    chosen: tuple[int, ...], differs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A spring for all balls may make up for a drag of every ball."""
+    nothing: Any = None
+
+    def called(name: str, grouped: bool) -> Any:
+        own = (1,) if grouped else ()
+        return SimpleNamespace(
+            effect=name, label=name, acts_on="v", depends_on=(), groupings=own, stores=(), kind="rate", generalises=()
+        )
+
+    terms = [called("spring", differs), called("drag", False)]
+    model = SimpleNamespace(groups={"ball": ("a", "b")})
+    search: Any = SimpleNamespace(terms=terms, plan=SimpleNamespace(augmented=SimpleNamespace(model=model)), tried=0)
+    base, own, drag = Trial((), nothing), Trial(chosen, nothing), Trial((1,), nothing)
+    stages = (SimpleNamespace(before=base, trials=(Trial((0,), nothing), drag)),)
+    selection: Any = SimpleNamespace(chosen=own, base=base, stages=stages)
+    selection._replace = lambda chosen: SimpleNamespace(chosen=chosen, stages=stages)
+    effects = [
+        Expression(name, acts_on="v", term="-k*v", parameters={"k": {"range": [0, 1]}}) for name in ("spring", "drag")
+    ]
+    small: Any = SimpleNamespace(part=lambda _, rest: Trial(rest, nothing), plan=nothing, tried=0)
+    added: list[tuple[int, ...]] = []
+    asked_of: list[tuple[str, bool, list[Trial]]] = []
+
+    def answers(_: Any, __: Any, at: Trial, questions: Any, ___: int) -> list[Grouping]:
+        asked_of.extend((q.of.effect, q.of.accepted, q.trials(at)[1]) for q in questions)
+        return []
+
+    module = grouping_module
+    monkeypatch.setattr(module, "_small", lambda *_: (small, own))
+    monkeypatch.setattr(module, "judged", answers)
+    monkeypatch.setattr(module, "_leaders", unwrap(module._leaders))
+    monkeypatch.setattr(module, "_added", lambda _, at, *__: added.append(at.terms) or drag)
+    monkeypatch.setattr(module, "_differing", lambda _, at, *__: at)
+    assessor: Any = SimpleNamespace(of=lambda _: nothing)
+    terminal: Any = SimpleNamespace(line=lambda *_: None)
+    unwrap(module.groupings)(search, assessor, selection, False, effects, nothing, nothing, terminal)
+    asks = {name: parts for name, _, parts in asked_of}
+    if not chosen:  # beside the simulator alone all are
+        assert added == [(), ()]
+    elif differs:
+        assert asks == {}
+    else:
+        assert asks == {"spring": [own], "drag": [own]}
+        assert added == [()]  # in its place, not beside it
