@@ -359,7 +359,8 @@ def _with(
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)
     attach_said = partial(attach, saying(model, between_rows))
-    if not ground.budget.over("functions of two arguments"):
+    # what simulations have chosen need not be worth anything one row ahead: no function may take its place there
+    if by_simulations is None and not ground.budget.over("functions of two arguments"):
         selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     alone_levels = NoiseProfile(search, assessor, selection.base)
     alone = drifting(alone_levels) if selection.chosen.terms else None
@@ -368,7 +369,7 @@ def _with(
         again = asked_again(chosen_of(found, selection), *promising, attach_said, options, terminal)
         if again is not None and not model.groups:
             return again
-    # what simulations have chosen need not be worth anything one row ahead
+    # nor may a drift
     if by_simulations is None and stands_for(alone, selection.base, selection.chosen):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
         selection, gates = cut(search, selection, [])._replace(remainder=None), []
