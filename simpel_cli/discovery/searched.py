@@ -340,10 +340,7 @@ def _with(
         found, selection, gates = outcome
     search, windows = found.search, found.test
     by_simulations = None
-    simulate = options.simulations
-    if simulate is None:  # beside groups it would take for effects what differs from one to another
-        asks = options.for_ == FREE_RUN and not model.groups
-        simulate = asks and worth_simulating(search, assessor, selection)
+    simulate = worth_simulating(search, assessor, selection, options)
     if simulate and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)

@@ -121,8 +121,14 @@ def test_what_explains_most_of_a_free_run_asks_for_no_simulations() -> None:
     assessor = Assessor(search.plan, 10)
     found = select(search, search.base())
     assert found.chosen.terms
-    assert not worth_simulating(search, assessor, found)
-    assert worth_simulating(search, assessor, found._replace(chosen=found.base))  # nothing is gone
+    free = Discovery(for_="free_run")
+    assert not worth_simulating(search, assessor, found, free)
+    nothing = found._replace(chosen=found.base)  # nothing is gone
+    assert worth_simulating(search, assessor, nothing, free)
+    # but what the model is for, and what the user says, decide first
+    assert not worth_simulating(search, assessor, nothing, Discovery())
+    assert not worth_simulating(search, assessor, nothing, Discovery(for_="free_run", simulations=False))
+    assert worth_simulating(search, assessor, found, Discovery(simulations=True))
 
 
 def test_a_model_that_runs_away_asks_for_simulations() -> None:
@@ -133,9 +139,14 @@ def test_a_model_that_runs_away_asks_for_simulations() -> None:
     away = np.where(np.arange(3)[:, None, None] == 0, np.nan, 1e-3 * free)
     errors = {0.0: free, 1.0: away}
     coordinates = SimpleNamespace(sizes=(1, 1, 0), value=lambda *_: 0.01)
-    search: Any = SimpleNamespace(plan=SimpleNamespace(coordinates=coordinates, windows=None))
+    model = SimpleNamespace(groups={})
+    augmented, free_run = SimpleNamespace(model=model), Discovery(for_="free_run")
+    search: Any = SimpleNamespace(plan=SimpleNamespace(coordinates=coordinates, windows=None, augmented=augmented))
     assessor: Any = lambda z, _: SimpleNamespace(free=errors[float(z[0])])  # noqa: E731
     selection: Any = SimpleNamespace(base=base, chosen=lost)
-    assert unwrap(worth_simulating)(search, assessor, selection)
+    assert unwrap(worth_simulating)(search, assessor, selection, free_run)
+    model.groups = {"ball": ("a", "b")}
+    assert not unwrap(worth_simulating)(search, assessor, selection, free_run)
+    model.groups = {}
     errors[1.0] = 1e-3 * free
-    assert not unwrap(worth_simulating)(search, assessor, selection)
+    assert not unwrap(worth_simulating)(search, assessor, selection, free_run)

@@ -19,6 +19,7 @@ from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.share import shares
 from simpel_cli.discovery.search.smaller import carried, carried_windows, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
+from simpel_cli.discovery.search.uses import FREE_RUN
 from simpel_cli.filtering.errors_ahead import Assessor, rmse, with_lost
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
@@ -27,12 +28,18 @@ from simpel_cli.runs.console import Terminal
 NEARLY_ALL = 0.8  # of the mean square error of a free run beyond the noise: beside that simulations ask for little
 
 
-def worth_simulating(found: Search, assessor: Assessor, selection: Selection) -> bool:
-    """Whether what an ordinary search has found leaves much of the error of a free run, of any quantity.
+def worth_simulating(found: Search, assessor: Assessor, selection: Selection, options: Discovery) -> bool:
+    """Whether there is a search by simulations: as the user says, or where one is worth making.
 
-    Where one of the two models runs away, its error is large; where both do, nothing is known.
+    That is where a model is for free runs, and what an ordinary search has found leaves much of the error of one, of any
+    quantity; not beside groups, where it would take for effects what differs from one to another. Where one of the two models
+    runs away, its error is large; where both do, nothing is known.
     """
     plan = found.plan
+    if options.simulations is not None:
+        return options.simulations
+    if options.for_ != FREE_RUN or plan.augmented.model.groups:
+        return False
     n_p, n_r, _ = plan.coordinates.sizes
     z = selection.chosen.optimum.z
     noise = np.array([plan.coordinates.value(i, float(z[i])) for i in range(n_p, n_p + n_r)])
