@@ -12,7 +12,8 @@ from simpel_cli.data.checks.saturation import saturation
 from simpel_cli.data.checks.units import check_units, period
 from simpel_cli.data.column_noise import Told, column, column_noise, inside, noise_check
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.estimation.kinematics import Motion, derived, differences, kinematics
+from simpel_cli.data.estimation.derived_speeds import derived, differences
+from simpel_cli.data.estimation.kinematics import Motion, kinematics
 from simpel_cli.data.estimation.smoother import estimate_speeds, speeds
 from simpel_cli.data.files import Files, read_files
 from simpel_cli.data.groups import group_names, with_groups

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from test_sensor_checks import check, measured, motion
 
-from simpel_cli.data.estimation.kinematics import (
-    Motion,
-    agreement,
-    derived,
-    difference_kind,
-    differences,
-    is_filtered,
-    kinematics,
-)
+from simpel_cli.data.estimation.derived_speeds import derived, difference_kind, differences, filter_kind
+from simpel_cli.data.estimation.kinematics import Motion, agreement, kinematics
 
 RNG = np.random.default_rng(0)
 
@@ -169,7 +162,45 @@ def test_a_smoothed_difference_is_found(smooth: Callable, noise: float) -> None:
 def test_a_velocity_of_its_own_is_no_smoothed_difference(per_swing: int, noise: tuple[float, float]) -> None:
     t = 2 * np.pi / 3 / per_swing * np.arange(max(300, 3 * per_swing))
     p, v = (x + RNG.normal(0, s, len(t)) if s else x for x, s in zip(motion(t), noise, strict=True))
-    assert not is_filtered(Motion("a", "w", "rad/s", [(t, p, v)]))
+    assert filter_kind(Motion("a", "w", "rad/s", [(t, p, v)])) is None
+
+
+def low_pass(p: np.ndarray, dt: float) -> np.ndarray:
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([0.5], [1, -0.5], np.gradient(p, dt)))
+
+
+def butterworth(p: np.ndarray, dt: float) -> np.ndarray:
+    from scipy.signal import butter, lfilter
+
+    return np.asarray(lfilter(*butter(2, 0.3), np.diff(p, prepend=p[0]) / dt))
+
+
+def both_ways(p: np.ndarray, dt: float) -> np.ndarray:
+    from scipy.signal import filtfilt
+
+    return np.asarray(filtfilt([0.4], [1, -0.6], np.gradient(p, dt)))
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.12])
+@pytest.mark.parametrize("filtered", [low_pass, butterworth, both_ways])
+@pytest.mark.parametrize("noise", [0.001, 0.03])
+def test_a_filtered_difference_is_found(filtered: Callable, noise: float, missing: float) -> None:
+    t = 0.02 * np.arange(600)
+    p = motion(t)[0] + RNG.normal(0, noise, 600)
+    there = RNG.random(600) >= missing  # whole rows
+    found = Motion("a", "w", "rad/s", [(t[there], p[there], filtered(p, 0.02)[there])])
+    assert differences([found]) == {"w": "the smoothed difference of a"}
+
+
+@pytest.mark.parametrize("filtered", [low_pass, butterworth, both_ways])
+def test_a_filtered_velocity_of_its_own_is_none(filtered: Callable) -> None:
+    """A filter behind another sensor: what the position's noise is does not show in it."""
+    t = 0.02 * np.arange(600)
+    p, v = motion(t)
+    noisy = np.cumsum(v + RNG.normal(0, 0.03, 600)) * 0.02
+    assert filter_kind(Motion("a", "w", "rad/s", [(t, p + RNG.normal(0, 0.01, 600), filtered(noisy, 0.02))])) is None
 
 
 def test_a_declared_one_is_no_news() -> None:

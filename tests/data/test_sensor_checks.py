@@ -7,7 +7,8 @@ import pytest
 
 from simpel_cli.data import Check, Measurements, Recording, read
 from simpel_cli.data.checks.sensors import held, jitter, quantisation, quantum, stale
-from simpel_cli.data.estimation.kinematics import Motion, derived, kinematics
+from simpel_cli.data.estimation.derived_speeds import derived
+from simpel_cli.data.estimation.kinematics import Motion, kinematics
 from simulators.model import Declared
 
 SWING = Declared(

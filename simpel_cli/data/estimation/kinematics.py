@@ -1,4 +1,4 @@
-"""Whether a measured velocity is the rate of the measured position, and whether it is a measurement of its own.
+"""Whether a measured velocity is the rate of the measured position: scale, sign, offset.
 
     p(t_k+w) - p(t_k) = s * integral_t_k^t_k+w v dt + o * (t_k+w - t_k) + noise,      s = 1, o = 0
 
@@ -7,7 +7,6 @@ least squares find s best. The velocity's own noise biases s by less than its sh
 """
 
 from collections.abc import Sequence
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +20,6 @@ UNRELATED = 0.5  # of the variance of the position's changes; more left unexplai
 NOISE_SHARE = 4.0  # times the variance of the noise, which is an estimate, may stay unexplained
 FEW_WINDOWS = 12
 RESTING = 4.0  # times the variance that its noise alone gives the integrated velocity; below, it tells nothing
-DERIVED = 0.25  # of the velocity's noise; an independent sensor differs from a difference by at least all of it
-REACH = 5  # rows that a smoothed difference may reach to either side
-ROWS_PER_WEIGHT = 5  # fewer, and least squares explain anything
-WHITE = 0.7  # white noise has the same level at orders 4 and 8; a smooth signal loses it, a coarsely sampled one gains
-FILTERED = 0.1  # of the position's noise in the velocity; one of its own sensor differs by all of it
-NOISE_FREE = 1e-6  # of the velocity: less noise is rounding, and tells nothing of where the numbers came from
 FACTORS = {  # velocity column / rate of the position
     180 / np.pi: "the velocity looks like degrees per s where the position is in rad",
     np.pi / 180: "the position looks like degrees where the velocity is in rad per s",
@@ -81,35 +74,6 @@ def kinematics(motions: Sequence[Motion]) -> Check:
     return Check("kinematics", not faults, "; ".join(faults) if faults else names)
 
 
-def differences(motions: Sequence[Motion]) -> dict[str, str]:
-    """Find velocities that are a difference quotient of the position, and so no measurement of their own.
-
-    Args:
-        motions: pairs (position, velocity) with d(position)/dt = velocity in the simulator.
-
-    Returns:
-        Name of the velocity -> which difference of which position it is.
-    """
-    found = {}
-    for motion in motions:
-        kind = difference_kind(motion) or ("smoothed" if is_filtered(motion) else None)
-        if kind:
-            found[motion.velocity] = f"the {kind} difference of {motion.position}"
-    return found
-
-
-def derived(motions: Sequence[Motion], declared: Sequence[str] = ()) -> Check:
-    """Report velocities that are a difference quotient of the position; those that were declared are no news."""
-    found = {name: kind for name, kind in differences(motions).items() if name not in declared}
-    note = f"{', '.join(declared)}: declared as computed from other columns" if declared else ""
-    if not found:
-        return Check("derived", True, note or "no velocity is a difference of its position")
-    equal = "; ".join(f"{name} is {kind}" for name, kind in found.items())
-    nulls = ", ".join(f"{name}: null" for name in found)
-    also = f"; {note}" if note else ""
-    return Check("derived", False, f"{equal}, not a measurement of its own: set data.columns {{{nulls}}}{also}")
-
-
 def agreement(motion: Motion) -> Agreement | None:
     """Fit scale and offset between a velocity and the rate of its position; None where rows are too few, or rest."""
     from scipy.interpolate import CubicSpline  # here, since its import takes long
@@ -157,65 +121,6 @@ def _fit(time: np.ndarray, change: np.ndarray, integral: np.ndarray, variance: f
     return Agreement(
         1 / scale, abs(scale_error / scale), -drift / scale, max(abs(drift_error / scale), 1e-300), unexplained
     )
-
-
-def difference_kind(motion: Motion) -> str | None:
-    """Say of which difference quotient of the position the velocity consists: central, forward or backward, or None."""
-    columns: dict[str, list[np.ndarray]] = {"central": [], "forward": [], "backward": []}
-    thirds, speeds = [], []
-    for t, p, v in motion.pieces:
-        if len(t) < 5:
-            continue
-        inner = v[1:-1]
-        columns["central"].append((p[2:] - p[:-2]) / (t[2:] - t[:-2]) - inner)
-        columns["forward"].append((p[2:] - p[1:-1]) / (t[2:] - t[1:-1]) - inner)
-        columns["backward"].append((p[1:-1] - p[:-2]) / (t[1:-1] - t[:-2]) - inner)
-        thirds.append(np.abs(np.diff(v, 3)) / np.sqrt(20))
-        speeds.append(inner)
-    if not speeds:
-        return None
-    typical = float(np.sqrt(np.median(np.concatenate(speeds) ** 2)))
-    noise = float(np.median(np.concatenate(thirds)))
-    if noise <= NOISE_FREE * typical or noise == 0:
-        return None
-    residuals = {kind: float(np.median(np.abs(np.concatenate(r)))) for kind, r in columns.items()}
-    kind = min(residuals, key=lambda name: residuals[name])
-    return kind if residuals[kind] < DERIVED * noise else None
-
-
-def is_filtered(motion: Motion) -> bool:
-    """Whether the velocity is a moving weighted sum of the position: a smoothed difference, e.g. Savitzky and Golay's.
-
-        v[k] = sum_j c[j] p[k + j],    |j| <= REACH
-
-    Any smooth motion without noise can be differentiated so, hence the position must carry noise: its high differences
-    must be those of a white signal. That noise cannot be in a velocity of another sensor, and reading it through c shows
-    what an independent velocity would differ by at least.
-
-    Reference: Savitzky and Golay (1964), Smoothing and differentiation of data by simplified least squares procedures.
-    """
-    width = 2 * REACH + 1
-    pieces = [(p - np.mean(p), v) for _, p, v in motion.pieces if len(p) > 2 * width]
-    if sum(len(p) - width + 1 for p, _ in pieces) < ROWS_PER_WEIGHT * width:
-        return False
-    levels = [_white_level([p for p, _ in pieces], order) for order in (4, 8)]
-    if not WHITE * levels[0] < levels[1] < levels[0] / WHITE:
-        return False
-    design = np.concatenate([np.lib.stride_tricks.sliding_window_view(p, width) for p, _ in pieces])
-    beside, centre = np.delete(design, REACH, axis=1), design[:, REACH]
-    foreseen = beside @ np.linalg.lstsq(beside, centre, rcond=None)[0]
-    if np.median(np.abs(centre - foreseen)) < WHITE * 0.6745 * levels[0]:  # a swing, however coarsely it is sampled
-        return False
-    target = np.concatenate([v[REACH:-REACH] for _, v in pieces])
-    weights = np.linalg.lstsq(design, target, rcond=None)[0]
-    passed = levels[0] * float(np.sqrt(weights @ weights))  # noise of the position that such a velocity has in it
-    return bool(np.median(np.abs(target - design @ weights)) < FILTERED * passed)
-
-
-def _white_level(signals: Sequence[np.ndarray], order: int) -> float:
-    """Standard deviation of the white noise that differences of some order would come from, by their median."""
-    gain = np.sqrt(comb(2 * order, order))
-    return float(np.median(np.abs(np.concatenate([np.diff(s, order) for s in signals])))) / (0.6745 * gain)
 
 
 def _fault(motion: Motion) -> str | None:

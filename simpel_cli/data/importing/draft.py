@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.data.config import Measurements
-from simpel_cli.data.estimation.kinematics import Motion, difference_kind
+from simpel_cli.data.estimation.derived_speeds import difference_kind
+from simpel_cli.data.estimation.kinematics import Motion
 from simpel_cli.data.importing.clock import Clock, clock_of
 from simpel_cli.data.importing.columns import Column, columns_of, with_jumps
 from simpel_cli.data.importing.episodes import Parts, parts_of
