@@ -9,9 +9,8 @@ are held from a row to the next, so c' jumps at the rows. A jump J at age a adds
 
     J tau exp((d - a)/tau)  where d <= a,    J (d + tau - a)  where the delay reaches behind it,
 
-and one of c'' likewise, -J tau^2 exp((d - a)/tau) or -J ((d - a)^2/2 + (d - a) tau + tau^2). The filter of `discover` reads so
-without the latter. What y says of the state is solved for by Newton's method with one slope: exact in one
-step for a linear system.
+and one of c'' likewise, -J tau^2 exp((d - a)/tau) or -J ((d - a)^2/2 + (d - a) tau + tau^2). What y says of the state is
+solved for by Newton's method with one slope: exact in one step for a linear system.
 """
 
 from collections.abc import Callable
@@ -87,7 +86,7 @@ class Late(NamedTuple):
             return shown
         both = [(motion(rows[-k, 0], 0), motion(rows[-k - 1, -1], -1)) for k in range(1, past + 1)]
         once, twice = (jnp.stack([to[i] - was[i] for to, was in both]) for i in (0, 1))
-        return shown + echo(d, tau, once, self.dt) - _of_curvature(d, tau, twice, self.dt)
+        return shown + echo(d, tau, once, self.dt) - echo_of_curvature(d, tau, twice, self.dt)
 
     def meant(self, read: Point, rows: Rows, phi: Float[Array, " dp"]) -> Point:
         """Return the states, as prompt sensors show them, of what late ones showed at the end of rows."""
@@ -159,7 +158,9 @@ def echo(
     return jnp.sum((tau[None] * faded - jnp.minimum(age, 0.0)) * jumps, axis=0)
 
 
-def _of_curvature(d: Float[Array, " n"], tau: Float[Array, " n"], jumps: Float[Array, "K n"], dt: float) -> Array:
+def echo_of_curvature(
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K ny ..."], dt: float
+) -> Float[Array, "ny ..."]:
     """Return the same of jumps of the second derivative."""
     age, faded = _faded(d, tau, len(jumps), dt)
     ahead = jnp.maximum(-age, 0.0)

@@ -242,7 +242,8 @@ def _window(
     track, held = rule.track(p, noise, y, ok, u, start, spread)
     u_sub = rule.delayed_inputs(p, u)
     rows, ny = y.shape
-    jumps = jnp.broadcast_to(no_jumps(ny, start), (rows, JUMPS, ny)) if held.jumps is None else held.jumps
+    quiet = no_jumps(ny, start)
+    jumps = jnp.broadcast_to(quiet, (rows, *quiet.shape)) if held.jumps is None else held.jumps
 
     def step(carry: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], None]:
         before, x, jumps = carry

@@ -34,7 +34,7 @@ from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import Timing, pushes_of
-from simpel_cli.filtering.likelihood.sensor_delay import back, echo, no_jumps, pushed
+from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, no_jumps, pushed, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
@@ -173,11 +173,22 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
+    # else inputs stay as they are until the next row
+    rising = bool(linear or delays or lags or plays or slow or any(augmented.own_delay) or any(augmented.own_lag))
+
+    def moving(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
+        """Return the motion at a point of a row; u: of its substeps, in which inputs rise or fall evenly."""
+        bend = applied(rate_x, rate)
+        if rising and late_ones:
+            first, last = (plain_rates(x, end, p) for end in (u[0, 0], u[-1, -1]))
+            bend = bend + (last - first) / (substeps * length(u[0, 0]))
+        return Motion(rate, bend)
+
     def seen(
         p: Array,
         x: Array,
         inputs: tuple[Array, Array],
-        rate: Array,
+        motion: Motion,
         rate_x: Array,
         jumps: Array,
         begin: tuple[Array, ...],
@@ -189,11 +200,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         y, prompt = at_row(lambda u: sensors(x, u, p), *inputs, nu)
         read, slope = y, prompt
         if (early := early_of(inputs[1], nu)) is not None:
-            read = read + jnp.sum(prompt * way_back(early, x, rate, begin), axis=1)
+            read = read + jnp.sum(prompt * way_back(early, x, motion.rate, begin), axis=1)
             slope = slope_back(early, prompt, rate_x)
         if late_ones:
             d, tau = late_by(p)
-            read = read + jnp.sum(prompt * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
+            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt)
             slope = slope - (d + tau)[:, None] * product(prompt, rate_x)
         return read, slope, prompt
 
@@ -220,13 +231,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         u_sub, half, sure = inputs(p, u), of_half_a_row(noise.q, dt), sure_of(noise.r)
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
-            x, cov, u_before, rate, rate_x, jumps, begin = carry
+            x, cov, u_before, motion, rate_x, jumps, begin = carry
             y_k, (ok_k, larger), u_k = data
             predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0], nu)
-            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), rate, rate_x, jumps, begin)
-            before = (rate, jumps) if late_ones else (None, None)
+            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), motion, rate_x, jumps, begin)
+            before = (motion, jumps) if late_ones else (None, None)
             if late_ones:
-                jumps = pushed(jumps, prompt, rate, rates(x, u_k[0, 0], p)[0])
+                jumps = pushed(jumps, prompt, motion, moving(p, x, u_k, *rates(x, u_k[0, 0], p)))
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
@@ -245,7 +256,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 following,
                 after(cov, jacobian, of_row(half, pace), sure),
                 u_k[-1, -1],
-                rate_after,
+                moving(p, following, u_k, rate_after, rate_x_after),
                 rate_x_after,
                 jumps,
                 begin,
@@ -254,7 +265,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         first = u_sub[0, 0, 0]
         rate, rate_x = rates(start, first, p)
-        begin = (start, diagonal(spread), first, rate, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
+        motion = moving(p, start, u_sub[0], rate, rate_x)  # as if it had been going on so
+        begin = (start, diagonal(spread), first, motion, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
         return jax.lax.scan(row, begin, (y, counted(ok), u_sub))[1]
 
     def at_rest(u: Array, x: Array, rate: Array) -> tuple[Array, ...]:
@@ -272,9 +284,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
             now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
         if late_ones:
-            (d, tau), (rate, rate_x) = late_by(p), rates(x, end, p)
-            now = now + jnp.sum(slope * back(d, tau, rate, rate_x), axis=1) + echo(d, tau, jumps, dt)
-            jumps = pushed(jumps, slope, rate, rates(x, u[0, 0], p)[0])
+            (d, tau), motion = late_by(p), moving(p, x, u_before, *rates(x, end, p))
+            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt)
+            jumps = pushed(jumps, slope, motion, moving(p, x, u, *rates(x, u[0, 0], p)))
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})

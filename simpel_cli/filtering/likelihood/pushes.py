@@ -14,7 +14,7 @@ from jaxtyping import Array
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
-from simpel_cli.filtering.likelihood.sensor_delay import back, echo
+from simpel_cli.filtering.likelihood.sensor_delay import back, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, sure_of, where_asked
 from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
@@ -109,9 +109,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         if late is not None:
 
             def shown(late: tuple[Array, Array]) -> Array:
-                assert held.rate is not None
                 assert held.jumps is not None
-                return jnp.sum(held.prompt * back(*late, held.rate, held.rate_x), axis=1) + echo(*late, held.jumps, dt)
+                return jnp.sum(held.prompt * back(*late, held.motion), axis=1) + still_shown(*late, held.jumps, dt)
 
             reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
 

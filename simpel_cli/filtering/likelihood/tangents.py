@@ -26,7 +26,7 @@ from simpel_cli.filtering.likelihood.clock import early_of
 from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import SMALL, Timing
-from simpel_cli.filtering.likelihood.sensor_delay import back, echo, pushed
+from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, pushed, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
@@ -47,7 +47,7 @@ class _Moved(NamedTuple):
     Args:
         state: (nx, ...).
         cov: (nx, nx, ...).
-        rate: at the end of the row before.
+        motion: at the end of the row before.
         jumps: of what the sensors read.
         begin: state and rate at the row before.
         bent: slope of the rates at the end of the row before, as far as the state there moves it.
@@ -55,7 +55,7 @@ class _Moved(NamedTuple):
 
     state: Array
     cov: Any
-    rate: Any
+    motion: Any
     jumps: Any
     begin: Any
     bent: Any
@@ -95,12 +95,16 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
         """The first row lies where the window begins, at rest."""
         nothing = jnp.zeros_like(rows.at.mean[0])
         square = jnp.zeros_like(rows.at.jacobian[0])
-        rate = nothing if push is None or push.now is None else push.now[0]
+        begun = None if push is None else jax.tree.map(lambda a: a[0], push)
+        rate = nothing if begun is None or begun.now is None else begun.now
+        motion: Any = ()
+        if rows.ways.now is not None:
+            motion = _moving(rate, rows.ways.now[0], begun, None if rows.held.pace is None else rows.held.pace[0])
         uneven = rows.step is not None
         return _Moved(
             nothing,
             square if follows else (),
-            rate if rows.ways.now is not None else (),
+            motion,
             () if rows.held.jumps is None else jnp.zeros_like(rows.held.jumps[0]),
             (-dt * rate, rate) if uneven else (),
             square if uneven and rows.ways.turn is not None else (),
@@ -116,19 +120,20 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
         of_half: Array | None,
         sure: Array,
     ) -> tuple[_Moved, tuple[Array, Array]]:
-        state, cov, rate, jumps, begin, bent = moved
+        state, cov, motion, jumps, begin, bent = moved
         at, held, (ok, larger), ways, step = row
         early, follows = early_of(held.u[0, 0], nu), not isinstance(cov, tuple)
         read = applied(held.prompt, state)
         if push is not None:
             read = read + push.reading
         if early is not None:
-            read = read + jnp.sum(held.prompt * way_back(early, state, rate, (*begin, _there(step))), axis=1)
+            read = read + jnp.sum(held.prompt * way_back(early, state, motion.rate, (*begin, _there(step))), axis=1)
         if late is not None:
             assert ways.now is not None
-            read = read + jnp.sum(held.prompt * back(*late, rate, held.rate_x), axis=1) + echo(*late, jumps, dt)
+            read = read + jnp.sum(held.prompt * back(*late, motion), axis=1) + still_shown(*late, jumps, dt)
             now = applied(ways.now, state)
-            jumps = pushed(jumps, held.prompt, rate, now if push is None or push.now is None else now + push.now)
+            now = now if push is None or push.now is None else now + push.now
+            jumps = pushed(jumps, held.prompt, motion, _moving(now, ways.now, push, held.pace))
         turned = None
         if early is not None and ways.turn is not None and follows:
             bent = bent if push is None or push.bent is None else bent + push.bent
@@ -181,7 +186,19 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
             if push is not None and push.first is not None:
                 firsts, rate = firsts + push.first, rate + _there(push.end)
             begin = begin if early is None else (state, firsts)
-        return _Moved(end, cov, rate, jumps, begin, bent), (jnp.stack(of_e), jnp.stack(of_s))
+            motion = _moving(rate, ways.end, push, held.pace)
+        return _Moved(end, cov, motion, jumps, begin, bent), (jnp.stack(of_e), jnp.stack(of_s))
+
+    def _moving(rate: Array, rate_x: Array, push: Pushes | None, pace: Array | None) -> Motion:
+        """Return how the motion changes where its rates do.
+
+        What a push adds to the rates' rates is by how much it grows in the row: with the states, and with inputs that rise.
+        """
+        bend = applied(rate_x, rate)
+        if push is not None and push.first is not None:
+            step = dt if pace is None else dt * pace[None]
+            bend = bend + (_there(push.end) - push.first) / step
+        return Motion(rate, bend)
 
     return slopes
 
