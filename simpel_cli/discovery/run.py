@@ -18,6 +18,7 @@ from simpel_cli.discovery.next_experiment.determining import determining_experim
 from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentence_of
 from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
+from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.searched import Searched, search_of
@@ -95,7 +96,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     assert isinstance(study.system.source, Model)
     per = per_of(searched.groupings)
-    before, after = (assessor(t.optimum.z, searched.windows) for t in (selection.base, selection.chosen))
+    before, after = (assessed(search, assessor, t, searched.windows) for t in (selection.base, selection.chosen))
     outside = beyond(study.system.source, search, selection.chosen, searched.wider)
     found = _verdict(searched, outside, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}

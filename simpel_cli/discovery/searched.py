@@ -11,7 +11,7 @@ from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
-from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, with_own
+from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, spreads_in, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
@@ -113,7 +113,7 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
     plan, recording = search.plan, ground.clean.recording
     base = selection.base
     if per := per_of(found.groupings):
-        base = in_common(search, base, per)
+        base = in_common(search, base, spreads_in(search, per))
     narrow = narrowed(search, {q.name: (q.low, q.high) for q in declared.params})
     wider = 0.0
     if narrow is not None:

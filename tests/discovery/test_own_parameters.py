@@ -153,3 +153,15 @@ def test_where_it_is_declared() -> None:
     assert found["base"]["parameters"]["b"]["per"] == "rig"
     assert found["parameters"] == {"c": {"range": [0, 1], "per": "day"}}
     assert written(own, {}) == own
+
+
+def test_a_rig_that_was_never_seen_is_predicted_as_one_of_many(tmp_path: Path) -> None:
+    """Every rig has one episode: to the test episodes no value of their own is known, and no error grows there."""
+    gains = "{count: 16, parameters: {b: {law: normal, std: 0.26}}}"
+    verdict = discovered(tmp_path, gains, "b*u", "effect=[input_dead_zone]")
+    (one,) = (g for g in verdict["grouping"] if g["pays"])
+    assert (one["parameter"], one["per"]) == ("b", "rig")
+    assert "grows" not in verdict["summary"]
+    for horizon, errors in verdict["error"]["before"].items():
+        if horizon != "log_likelihood_per_step":
+            assert all(verdict["error"]["after"][horizon][name] < 1.05 * e for name, e in errors.items())

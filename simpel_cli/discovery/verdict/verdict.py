@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Check
+from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.held_out_gate import AHEAD, Errors, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.share import explained
@@ -128,7 +129,7 @@ def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: 
     for trial in selection.path:
         added = [search.terms[t].label for t in trial.terms if t not in before]
         before = set(trial.terms)
-        steps.append({"added": added, "error": results(assessor(trial.optimum.z, windows), measured, rows)})
+        steps.append({"added": added, "error": results(assessed(search, assessor, trial, windows), measured, rows)})
     return steps
 
 

@@ -81,17 +81,24 @@ def per_of(found: list[Grouping]) -> dict[str, str]:
     return {g.parameter: g.per for g in found if g.parameter and g.pays}
 
 
-def in_common(search: Search, base: Trial, per: Mapping[str, str]) -> Trial:
-    """Return a simulator's fit in which parameters that differ have one value for all groups."""
+def spreads_in(search: Search, per: Mapping[str, str]) -> list[int]:
+    """Return the spreads of parameters of the simulator that differ."""
     rows = {q.name: i for i, q in enumerate(search.plan.augmented.params)}
-    spreads = [rows[f"{name}_{SPREAD}"] for name in per]
-    members = {i for row in spreads for i in search.own[row]}
-    starts = [search.loud(base.optimum.z), search.plan.start.copy()]
+    return [rows[f"{name}_{SPREAD}"] for name in per]
+
+
+def in_common(search: Search, trial: Trial, spreads: Sequence[int]) -> Trial:
+    """Return the fit of a model in which what has these spreads has one value for all groups."""
+    members = {i for row in spreads for i in search.spreads[row]}
+    again = search.plan.start.copy()
+    own = [row for t in trial.terms for row in search.all_rows(t)]
+    again[own] = trial.optimum.z[own]
+    starts = [search.loud(trial.optimum.z), again]
     for z in starts:
-        z[spreads], z[list(members)] = 0.0, 0.5
-    free = tuple(i for i in base.optimum.free if i not in members)
+        z[[*spreads]], z[[*members]] = 0.0, 0.5
+    free = tuple(i for i in trial.optimum.free if i not in members)
     found = search.fitter([Hypothesis(z, free, search.ones) for z in starts])
-    return Trial(base.terms, max(found, key=lambda o: o.log_evidence))
+    return Trial(trial.terms, max(found, key=lambda o: o.log_evidence))
 
 
 def declared_in(sim: dict[str, Any]) -> set[str]:
