@@ -1,4 +1,4 @@
-"""Where windows begin in the states that nothing measures.
+"""Where windows begin in the states that nothing measures, or of which the first value is missing.
 
 The middle of the range, with all of the range as spread, is too much for a filter that linearises: a level enters under a
 root. So a smoother looks back at the first row, and the filter begins anew from there, some times over. The spread stays
@@ -20,7 +20,7 @@ LEAST, MOST = 0.15, 1.0  # of the spread that it began with
 
 
 def begun(filtering: Tracking, z: np.ndarray, windows: Windows, rows: int | None = None) -> Windows:
-    """Return windows with a better guess of the first value of every state that nothing measures.
+    """Return windows with a better guess of every first state that nothing measured.
 
     Args:
         filtering: of the models.
@@ -28,26 +28,34 @@ def begun(filtering: Tracking, z: np.ndarray, windows: Windows, rows: int | None
         windows: whose first states are guessed.
         rows: of a window that the guess may look at; None: all of them.
     """
-    augmented = filtering.plan.augmented
-    states = augmented.model.states
-    hidden = [i for i, q in enumerate(states) if q.name not in augmented.measured]
-    if not hidden:
+    unseen = _unseen(filtering, windows)
+    if not unseen.any():
         return windows
-    low, high = (np.array([getattr(states[i], end) for i in hidden]) for end in ("low", "high"))
-    first = windows.spread[:, hidden]
+    states = filtering.plan.augmented.model.states
+    low, high = (np.array([getattr(q, end) for q in states]) for end in ("low", "high"))
+    wide = windows.spread
     for _ in range(PASSES):
         try:
             found = smooth(filtering.track(z, windows if rows is None else windows.first(rows)))
         except np.linalg.LinAlgError:
             break
-        mean = found.mean[:, 0][:, hidden]
-        sd = np.sqrt(np.maximum(np.stack([found.cov[:, 0, i, i] for i in hidden], axis=1), 0.0))
-        known = np.isfinite(mean) & np.isfinite(sd)
-        start, spread = windows.start.copy(), windows.spread.copy()
-        start[:, hidden] = np.where(known, np.clip(mean, low, high), start[:, hidden])
-        spread[:, hidden] = np.where(known, np.clip(WIDE * sd, LEAST * first, MOST * first), spread[:, hidden])
-        windows = windows._replace(start=start, spread=spread)
+        mean = found.mean[:, 0]
+        sd = np.sqrt(np.maximum(np.diagonal(found.cov[:, 0], axis1=1, axis2=2), 0.0))
+        known = unseen & np.isfinite(mean) & np.isfinite(sd)
+        windows = windows._replace(
+            start=np.where(known, np.clip(mean, low, high), windows.start),
+            spread=np.where(known, np.clip(WIDE * sd, LEAST * wide, MOST * wide), windows.spread),
+        )
     return windows
+
+
+def _unseen(filtering: Tracking, windows: Windows) -> np.ndarray:
+    """Return which states no sensor shows in the first row of a window, (W, nx)."""
+    augmented = filtering.plan.augmented
+    there = windows.ok[:, 0] > 0
+    columns = {name: there[:, j] for j, name in enumerate(augmented.measured)}
+    nowhere = np.zeros(len(there), bool)
+    return np.stack([~columns.get(q.name, nowhere) for q in augmented.model.states], axis=1)
 
 
 def moved(before: Windows, after: Windows) -> bool:

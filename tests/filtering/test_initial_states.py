@@ -102,3 +102,17 @@ def test_beside_short_episodes_a_long_one_is_cut(plan: Setup) -> None:
     assert cut.y.shape[1] < 6000
     assert cut.y.shape[0] * cut.y.shape[1] <= 4.5 * 12000
     assert whole_windows(plan, [of(6000)], ()).y.shape[:2] == (3, 2000)
+
+
+def test_a_first_value_that_is_missing_is_guessed_like_a_hidden_one(plan: Setup) -> None:
+    """Of a measured level: begun in the middle of its range, a filter that linearises a root is far off and sure of it."""
+    ok, start = plan.windows.ok.copy(), plan.windows.start.copy()
+    first = plan.windows.begin == 0
+    ok[first, 0, 1], start[first, 1] = 0.0, 60.0
+    gone = plan.windows._replace(ok=ok, start=start)
+    assessor = Assessor(plan, 5)
+    after = begun(assessor, plan.start, gone)
+    assert np.abs(after.start[first, 1] - 10.0).max() < 5.0
+    np.testing.assert_array_equal(after.start[~first, 1], gone.start[~first, 1])
+    lost, found = (assessor(plan.start, windows).log_likelihood[first].sum() for windows in (gone, after))
+    assert found > lost + 10
