@@ -108,7 +108,7 @@ def test_a_first_value_that_is_missing_is_guessed_like_a_hidden_one(plan: Setup)
     """Of a measured level: begun in the middle of its range, a filter that linearises a root is far off and sure of it."""
     ok, start = plan.windows.ok.copy(), plan.windows.start.copy()
     first = plan.windows.begin == 0
-    ok[first, 0, 1], start[first, 1] = 0.0, 60.0
+    ok[first, 0, 0], start[first, 1] = 0.0, 60.0
     gone = plan.windows._replace(ok=ok, start=start)
     assessor = Assessor(plan, 5)
     after = begun(assessor, plan.start, gone)
