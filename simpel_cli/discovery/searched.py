@@ -24,13 +24,13 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, ti
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import FREE_RUN, MOST_ROWS, ONE_STEP, calibrated_for, suited
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, suited, windows_for
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import outlier_check
-from simpel_cli.filtering.measurements.windows import Windows, thinned
-from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, terms_of, whole_windows, with_memory
+from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, terms_of, with_memory
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression
@@ -110,7 +110,6 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
     """
     use = ground.options.for_ or ONE_STEP
     search, selection = found.search, found.selection
-    plan, recording = search.plan, ground.clean.recording
     base = selection.base
     if per := per_of(found.groupings):
         base = in_common(search, base, spreads_in(search, per))
@@ -123,16 +122,22 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
         wider = selection.chosen.optimum.log_evidence - within(search, narrow, selection.chosen).optimum.log_evidence
         base = within(search, narrow, base)
 
-    def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial] = suited) -> Trial:
+    def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial]) -> Trial:
         assessor = found.assessor.of(search.plan)
         return calibration(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
 
     path, before = selection.path, selection.path[-1]
     if use != ONE_STEP:
-        whole = thinned(whole_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
-        base, chosen = of_use(narrow or search, base), of_use(search, before)
-        # what is between follows the last
-        path = (*(of_use(search, t, calibrated_for) for t in path[:-1]), chosen) if chosen is not before else path
+        whole = windows_for(search.plan, ground.clean.recording, use)
+        late = ground.budget.over(
+            "whether a calibration for the use does as well on other episodes; steps before the last"
+        )
+        base, chosen = (
+            of_use(s, t, calibrated_for if late else suited) for s, t in ((narrow or search, base), (search, before))
+        )
+        between = () if late else path[1:-1]
+        if chosen is not before:  # what is between follows the last
+            path = (*(of_use(search, t, calibrated_for) for t in (*path[:1], *between) if t is not before), chosen)
     base = base if narrow is None else translated(narrow, search, base)
     selection = selection._replace(base=base, chosen=path[-1], path=path)
     found = found._replace(wider=wider, selection=selection)

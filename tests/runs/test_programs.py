@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -131,3 +132,24 @@ def test_a_number_without_a_type_of_its_own_is_another_program(folder: Path) -> 
     program = Program(lambda x, s: x * s, "scaled")
     x = jnp.ones(2, jnp.float32)
     assert program(x, jnp.asarray(2.0)).dtype == jax.jit(lambda x, s: x * s)(x, jnp.asarray(2.0)).dtype
+
+
+def test_how_programs_are_compiled_is_the_users_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(programs, "current_device", lambda: SimpleNamespace(platform="cpu"))
+    level, emitters = programs.QUICK
+    monkeypatch.setenv("XLA_FLAGS", "")
+    assert set(programs._options()) == {name for name in (level, emitters) if programs._known_to_xla(name)}
+    monkeypatch.setenv("XLA_FLAGS", f"--{level}=2")
+    assert level not in programs._options()
+    monkeypatch.setenv("XLA_FLAGS", "flags.txt")
+    assert programs._options() == {}
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(programs, "current_device", lambda: SimpleNamespace(platform="gpu"))
+    assert programs._options() == {}
+
+
+def test_an_option_that_this_version_of_xla_does_not_have_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(programs, "QUICK", {"no_such_option": 1})
+    monkeypatch.setattr(programs, "current_device", lambda: SimpleNamespace(platform="cpu"))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    assert programs._options() == {}

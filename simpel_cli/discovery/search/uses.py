@@ -19,10 +19,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from simpel_cli.data import Recording
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor, with_lost
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
-from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, thinned
+from simpel_cli.filtering.setup import Setup, whole_windows
 from simulators.effects.term import ON_SENSOR, SENSOR
 
 ONE_STEP, FREE_RUN = "one_step", "free_run"
@@ -32,6 +34,8 @@ HALF_TURN = 2.8  # rad: an error of an angle beyond may jump by a turn
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 15  # steps
 MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
+MOST_ROWS_AHEAD = 4000  # where the model is for some seconds: the same windows as the search's, whose program is there
+ENOUGH = 1e-4  # of the cost: about a tenth of a nat
 MOST_FOLDS = 5
 CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
 
@@ -89,12 +93,29 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     def one(at: np.ndarray) -> np.ndarray:
         return residual(at[None])[0]
 
-    found: Any = least_squares(one, begin, slope, bounds=(0.0, 1.0), max_nfev=MOST)
+    found: Any = least_squares(one, begin, slope, bounds=(0.0, 1.0), max_nfev=MOST, ftol=ENOUGH)
     if not found.cost < 0.5 * float(np.sum(residual(z[rows][None]) ** 2)):
         return trial
     moved = z.copy()
     moved[rows] = found.x
     return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
+
+
+def windows_for(plan: Setup, recording: Recording, use: str | float) -> Windows:
+    """Return the training windows in which a model is calibrated for a use, evenly spaced ones of a long record.
+
+    Args:
+        plan: of the search, in whose windows it looked.
+        recording: the measurements.
+        use: FREE_RUN: as long as their episodes; or how far ahead, s.
+    """
+    if use == FREE_RUN:
+        return thinned(whole_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
+    if plan.spare is None:
+        return plan.windows
+    every = Windows(*(np.concatenate(pair) for pair in zip(plan.windows, plan.spare, strict=True)))
+    order = np.lexsort((every.begin, every.episode))
+    return thinned(Windows(*(a[order] for a in every)), MOST_ROWS_AHEAD)[0]
 
 
 def _sizes(errors: np.ndarray) -> np.ndarray:
