@@ -96,7 +96,9 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     search, selection, assessor = searched.search, searched.selection, searched.assessor
     assert isinstance(study.system.source, Model)
     per = per_of(searched.groupings)
-    before, after = (assessed(search, assessor, t, searched.windows) for t in (selection.base, selection.chosen))
+    before, after = (
+        assessed(search, assessor, t, searched.windows, searched.for_use) for t in (selection.base, selection.chosen)
+    )
     outside = beyond(study.system.source, search, selection.chosen, searched.wider)
     found = _verdict(searched, outside, before, after, began)
     found["latency"] = {name: each._asdict() for name, each in latencies.items()}
@@ -134,7 +136,7 @@ def _verdict(
     found["between_rows"] = {name: p._asdict() for name, p in between_rows.items()}
     found["degrees_of_freedom"] = nu
     found["grouping"] = [g._asdict() | {"gate": g.gate and g.gate._asdict()} for g in asked]
-    found["steps"] = steps_of(search, selection, assessor, windows)
+    found["steps"] = steps_of(search, selection, assessor, windows, searched.for_use)
     found["left_out"] = search.budget.left_out
     found["drift"] = searched.drift and searched.drift._asdict()
     found["not_determined"] = [o._asdict() | {"words": o.words} for o in left_open(search, selection.chosen)]

@@ -24,7 +24,8 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, ti
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, suited, windows_for
+from simpel_cli.discovery.search.uses import ONE_STEP, calibrated_for, suited, windows_for
+from simpel_cli.discovery.search.uses import in_words as in_words_of_use
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
@@ -54,6 +55,7 @@ class Searched(NamedTuple):
         drift: a parameter that is no constant; None: there is none.
         wider: nats by which the evidence of the chosen model is ahead of that within the ranges that were declared.
         again: a search that is worth making once what differs from group to group is known; None: there is none.
+        for_use: calibrates a model of the search for what it will be used for.
     """
 
     search: Search
@@ -69,6 +71,7 @@ class Searched(NamedTuple):
     wider: float = 0.0
     drift: Drift | None = None
     again: Again | None = None
+    for_use: Callable[[Trial], Trial] = lambda trial: trial
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
@@ -143,9 +146,9 @@ def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Termina
     found = found._replace(wider=wider, selection=selection)
     if use == ONE_STEP:
         return found
-    what = use if use == FREE_RUN else f"{use:g} s ahead"
+    found = found._replace(for_use=lambda trial: of_use(search, trial, calibrated_for))
     moved = path[-1] is not before
-    terminal.line(f"calibrated for {what}{'' if moved else ': what the innovations say does as well'}", "search")
+    terminal.line(in_words_of_use(use, whole, search.plan.augmented.model.dt, moved=moved), "search")
     return found
 
 

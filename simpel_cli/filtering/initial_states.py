@@ -32,7 +32,9 @@ def begun(filtering: Tracking, z: np.ndarray, windows: Windows, rows: int | None
     if not unseen.any():
         return windows
     states = filtering.plan.augmented.model.states
-    low, high = (np.array([getattr(q, end) for q in states]) for end in ("low", "high"))
+    measured = np.isin([q.name for q in states], filtering.plan.augmented.measured)  # its range is what was expected
+    low = np.where(measured, -np.inf, [q.low for q in states])
+    high = np.where(measured, np.inf, [q.high for q in states])
     wide = windows.spread
     for _ in range(PASSES):
         try:

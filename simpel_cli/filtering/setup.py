@@ -117,7 +117,7 @@ def setup(
     lead = int(np.ceil((longest + model.memory()) / model.dt)) + 2
     if any(t.kind in (BACKLASH, RATE_LIMIT) for t in every):
         lead = max(lead, PLAY_ROWS)
-    spread = np.array([max(scales.size[q.name], 1e-12) for q in model.states])
+    spread = spread_of(scales, model)
     timed = clocked([*recording.train, *recording.test], model.dt)
     windows = windows_of(
         recording.train, [q.name for q in model.states], measured, recording.outputs, centre_of(model), spread, lead=lead,
@@ -274,11 +274,16 @@ def whole_windows(
     while longest > windows_.LONGEST_RUN and padded([len(e.time) for e in episodes], longest) > MOST_PADDED:
         longest //= 2
     whole = windows_of(
-        episodes, [q.name for q in model.states], measured, outputs, centre_of(model), plan.windows.spread[0],
+        episodes, [q.name for q in model.states], measured, outputs, centre_of(model), spread_of(plan.scales, model),
         lead=plan.lead, dt=model.dt, clocked=plan.clocked,
         longest=longest,
     )  # fmt: skip
     return _filled(whole, model, stores, measured, plan.scales)
+
+
+def spread_of(scales: Scales, model: Model) -> np.ndarray:
+    """Return the standard deviation of a first state about its guess, (nx,)."""
+    return np.array([max(scales.size[q.name], 1e-12) for q in model.states])
 
 
 def _with_sizes(scales: Scales, stores: Sequence[Store]) -> Scales:

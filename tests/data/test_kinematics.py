@@ -194,6 +194,25 @@ def test_a_filtered_difference_is_found(filtered: Callable, noise: float, missin
     assert differences([found]) == {"w": "the smoothed difference of a"}
 
 
+@pytest.mark.parametrize(("rate", "tick"), [(60, 1e-3), (400, 1e-3), (15, 1e-2)])
+@pytest.mark.parametrize("filtered", [savitzky, low_pass, butterworth])
+def test_stamps_may_be_rounded(filtered: Callable, rate: float, tick: float) -> None:
+    """Their median step is not their mean one."""
+    t = np.arange(1500) / rate
+    p = motion(t)[0] + RNG.normal(0, 0.01, 1500)
+    found = Motion("a", "w", "rad/s", [(np.round(t / tick) * tick, p, filtered(p, 1 / rate))])
+    assert differences([found]) == {"w": "the smoothed difference of a"}
+
+
+def test_a_long_pause_is_a_gap_like_others_and_no_rows_tell_nothing() -> None:
+    t = 0.02 * np.arange(600)
+    p = motion(t)[0] + RNG.normal(0, 0.01, 600)
+    paused = np.where(np.arange(600) < 300, t, t + 1e7)
+    assert filter_kind(Motion("a", "w", "rad/s", [(paused, p, low_pass(p, 0.02))])) == "smoothed"
+    assert filter_kind(Motion("a", "w", "rad/s", [(t[:1], p[:1], p[:1])])) is None
+    assert filter_kind(Motion("a", "w", "rad/s", [])) is None
+
+
 @pytest.mark.parametrize("filtered", [low_pass, butterworth, both_ways])
 def test_a_filtered_velocity_of_its_own_is_none(filtered: Callable) -> None:
     """A filter behind another sensor: what the position's noise is does not show in it."""

@@ -8,7 +8,15 @@ from test_ranges import measured, searched
 
 from simpel_cli.config.build import build
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for, correlation_time, suited
+from simpel_cli.discovery.search.uses import (
+    FREE_RUN,
+    ONE_STEP,
+    calibrated_for,
+    correlation_time,
+    in_words,
+    suited,
+    windows_for,
+)
 from simpel_cli.errors import ConfigError
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
 from simpel_cli.filtering.setup import whole_windows as held_out
@@ -89,3 +97,21 @@ def test_a_model_that_simulates_better_on_unseen_episodes_is_taken() -> None:
     windows = held_out(search.plan, recording.train, ())
     assert suited(search, assessor, base, windows, FREE_RUN) is not base
     assert suited(search, assessor, base, windows, ONE_STEP) is base
+
+
+def test_windows_are_long_against_what_the_model_is_for() -> None:
+    """Of the search's windows, a quarter of an episode each, none may reach so far; one that is too short is said to be."""
+    recording = measured(1.2)
+    plan, rows = searched(recording, []).plan, len(recording.train[0].time)
+    dt = plan.augmented.model.dt
+    far = (rows - 20) * dt
+    whole = windows_for(plan, recording, far)
+    assert whole.y.shape[1] == rows
+    assert np.isfinite(Assessor(plan, rows - 20)(plan.start, whole).ahead).any()
+    assert (
+        in_words(far, whole, dt, moved=False)
+        == f"calibrated for {far:g} s ahead: what the innovations say does as well"
+    )
+    too_far = (rows + 1) * dt
+    words = in_words(too_far, windows_for(plan, recording, too_far), dt, moved=False)
+    assert words == f"not calibrated for {too_far:g} s ahead: no training episode is so long"

@@ -27,6 +27,8 @@ ROWS_PER_WEIGHT = 5  # fewer, and least squares explain anything
 WHITE = 0.7  # white noise has the same level at orders 4 and 8; a smooth signal loses it, a coarsely sampled one gains
 FILTERED = 0.1  # of the position's noise in the velocity; one of its own sensor differs by all of it
 NOISE_FREE = 1e-6  # of the velocity: less noise is rounding, and tells nothing of where the numbers came from
+USUAL = 1.5  # times the median step: a longer one has a gap in it
+LONGEST_PAUSE = 11  # rows that a filter may read
 NORMAL = 0.6745  # median of the size of a normal variable of unit variance
 SMOOTHED = "smoothed"
 
@@ -107,7 +109,10 @@ def difference_kind(motion: Motion) -> str | None:
 def filter_kind(motion: Motion) -> str | None:
     """Say whether the velocity is a filtered difference of the position: `SMOOTHED`, or None. Rows may be missing."""
     pieces = [_on_grid(*piece) for piece in motion.pieces if len(piece[0]) > 1]
-    pieces = [(p - np.nanmean(p), v) for p, v in pieces]
+    if not pieces:
+        return None
+    centre = np.nanmean(np.concatenate([p for p, _ in pieces]))
+    pieces = [(p - centre, v) for p, v in pieces]
     levels = [_white_level([p for p, _ in pieces], order) for order in (4, 8)]
     if not WHITE * levels[0] < levels[1] < levels[0] / WHITE:
         return None
@@ -143,9 +148,12 @@ def _rows(form: Filter, p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _on_grid(t: np.ndarray, p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows in equal steps, NaN where one is missing."""
-    step = float(np.median(np.diff(t)))
-    k = np.round((t - t[0]) / step).astype(int)
+    """Return rows in equal steps, NaN where some are missing; stamps may be rounded, and no filter looks over a long pause."""
+    steps = np.diff(t)
+    usual = steps[steps < USUAL * np.median(steps)]
+    step = float(np.mean(usual)) if usual.size else float(np.median(steps))
+    rows = np.clip(np.rint(steps / step), 1, LONGEST_PAUSE) if step > 0 else np.ones(len(steps))
+    k = np.concatenate([[0], np.cumsum(rows)]).astype(int)
     both = np.full((2, k[-1] + 1), np.nan)
     both[:, k] = p, v
     return both[0], both[1]

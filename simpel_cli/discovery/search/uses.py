@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from simpel_cli.data import Recording
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.filtering.errors_ahead import Assessor, with_lost
+from simpel_cli.filtering.errors_ahead import SETTLE, Assessor, with_lost
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, thinned
 from simpel_cli.filtering.setup import Setup, whole_windows
@@ -34,7 +34,8 @@ HALF_TURN = 2.8  # rad: an error of an angle beyond may jump by a turn
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 15  # steps
 MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
-MOST_ROWS_AHEAD = 4000  # where the model is for some seconds: the same windows as the search's, whose program is there
+MOST_ROWS_AHEAD = 4000  # where the model is for some seconds
+MOST_OF_REACH = 4  # times the rows ahead that a window has
 ENOUGH = 1e-4  # of the cost: about a tenth of a nat
 MOST_FOLDS = 5
 CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
@@ -105,17 +106,28 @@ def windows_for(plan: Setup, recording: Recording, use: str | float) -> Windows:
     """Return the training windows in which a model is calibrated for a use, evenly spaced ones of a long record.
 
     Args:
-        plan: of the search, in whose windows it looked.
+        plan: of the search.
         recording: the measurements.
         use: FREE_RUN: as long as their episodes; or how far ahead, s.
     """
-    if use == FREE_RUN:
-        return thinned(whole_windows(plan, recording.train, recording.outputs), MOST_ROWS)[0]
-    if plan.spare is None:
-        return plan.windows
-    every = Windows(*(np.concatenate(pair) for pair in zip(plan.windows, plan.spare, strict=True)))
-    order = np.lexsort((every.begin, every.episode))
-    return thinned(Windows(*(a[order] for a in every)), MOST_ROWS_AHEAD)[0]
+    longest, most = None, MOST_ROWS
+    if use != FREE_RUN:  # the first rows of a window, from which none is so far ahead, are a small part of it
+        reach = SETTLE + rows_ahead(use, plan.augmented.model.dt)
+        longest, most = max(plan.windows.y.shape[1], MOST_OF_REACH * reach), MOST_ROWS_AHEAD
+    return thinned(whole_windows(plan, recording.train, recording.outputs, longest), most)[0]
+
+
+def in_words(use: str | float, windows: Windows, dt: float, *, moved: bool) -> str:
+    """Return what a calibration for a use in windows came to, in a line; moved: whether its parameters are others."""
+    what = use if use == FREE_RUN else f"{use:g} s ahead"
+    if use != FREE_RUN and windows.y.shape[1] <= SETTLE + rows_ahead(use, dt):
+        return f"not calibrated for {what}: no training episode is so long"
+    return f"calibrated for {what}{'' if moved else ': what the innovations say does as well'}"
+
+
+def rows_ahead(use: str | float, dt: float) -> int:
+    """Return how many rows ahead some seconds are."""
+    return max(1, round(float(use) / dt))
 
 
 def _sizes(errors: np.ndarray) -> np.ndarray:
@@ -186,5 +198,5 @@ def _placed(trial: Trial, rows: list[int], z: np.ndarray, covariance: np.ndarray
 def _errors_of(assessor: Assessor, windows: Windows, use: str | float, dt: float) -> Errors:
     if use == FREE_RUN:
         return lambda z: assessor.free_runs(z, windows)
-    ahead = assessor.of(assessor.plan, max(1, round(float(use) / dt)))
+    ahead = assessor.of(assessor.plan, rows_ahead(use, dt))
     return lambda z: np.stack([ahead(one, windows).ahead for one in z])

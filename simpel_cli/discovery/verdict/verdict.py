@@ -1,5 +1,6 @@
 """The verdict of a search: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,9 @@ def _parts(before: Assessment, after: Assessment, windows: Windows) -> tuple[Err
     return {k: e for k, (e, _) in first.items()}, {k: e for k, (e, _) in second.items()}, parts
 
 
-def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: Windows) -> list[dict[str, Any]]:
+def steps_of(
+    search: Search, selection: Selection, assessor: Assessor, windows: Windows, for_use: Callable[[Trial], Trial]
+) -> list[dict[str, Any]]:
     """Return the errors on the test windows after each accepted effect, from the calibrated simulator on."""
     measured = search.plan.augmented.measured
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
@@ -129,7 +132,8 @@ def steps_of(search: Search, selection: Selection, assessor: Assessor, windows: 
     for trial in selection.path:
         added = [search.terms[t].label for t in trial.terms if t not in before]
         before = set(trial.terms)
-        steps.append({"added": added, "error": results(assessed(search, assessor, trial, windows), measured, rows)})
+        found = assessed(search, assessor, trial, windows, for_use)
+        steps.append({"added": added, "error": results(found, measured, rows)})
     return steps
 
 

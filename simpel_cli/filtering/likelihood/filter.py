@@ -173,13 +173,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
-    # else inputs stay as they are until the next row
-    rising = bool(linear or delays or lags or plays or slow or any(augmented.own_delay) or any(augmented.own_lag))
-
     def moving(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
-        """Return the motion at a point of a row; u: of its substeps, in which inputs rise or fall evenly."""
+        """Return the motion at a point of a row; u: of its substeps. Linear inputs rise or fall evenly in it, others jump."""
         bend = applied(rate_x, rate)
-        if rising and late_ones:
+        if linear and late_ones:
             first, last = (plain_rates(x, end, p) for end in (u[0, 0], u[-1, -1]))
             bend = bend + (last - first) / (substeps * length(u[0, 0]))
         return Motion(rate, bend)
@@ -290,7 +287,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
-    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None)
+    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, bool(linear))
     return Filter(
         "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs
     )

@@ -32,6 +32,7 @@ class Timing(NamedTuple):
         inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu, ...).
         of_inputs: rows of p that say when an input arrives.
         late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
+        rising: whether inputs go straight from a row to the next.
     """
 
     dt: float
@@ -39,6 +40,7 @@ class Timing(NamedTuple):
     inputs: Callable[[Array, Array], Array]
     of_inputs: Sequence[int]
     late_by: Callable[[Array], tuple[Array, Array]] | None
+    rising: bool
 
 
 def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:

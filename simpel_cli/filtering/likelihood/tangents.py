@@ -192,10 +192,10 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
     def _moving(rate: Array, rate_x: Array, push: Pushes | None, pace: Array | None) -> Motion:
         """Return how the motion changes where its rates do.
 
-        What a push adds to the rates' rates is by how much it grows in the row: with the states, and with inputs that rise.
+        What a push adds to the rates' rates beside inputs that rise is by how much it grows in the row; else it is held.
         """
         bend = applied(rate_x, rate)
-        if push is not None and push.first is not None:
+        if timing.rising and push is not None and push.first is not None:
             step = dt if pace is None else dt * pace[None]
             bend = bend + (_there(push.end) - push.first) / step
         return Motion(rate, bend)

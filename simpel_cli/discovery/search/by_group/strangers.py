@@ -5,6 +5,7 @@ process noise as that needs, is overconfident there: one step ahead it would not
 by the same model with one value for all groups, and the noise that belongs to that.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,10 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor
 from simpel_cli.filtering.measurements.windows import Windows
 
 
-def assessed(search: Search, assessor: Assessor, trial: Trial, windows: Windows) -> Assessment:
+def assessed(
+    search: Search, assessor: Assessor, trial: Trial, windows: Windows,
+    for_use: Callable[[Trial], Trial] = lambda trial: trial,
+) -> Assessment:  # fmt: skip
     """Return the errors of a model on windows, of which some may be of groups that it was not fitted to.
 
     Args:
@@ -25,19 +29,30 @@ def assessed(search: Search, assessor: Assessor, trial: Trial, windows: Windows)
         assessor: of its program.
         trial: the model.
         windows: W of them.
+        for_use: calibrates a model for what it will be used for.
     """
     found = assessor(trial.optimum.z, windows)
     spreads = _differing(search, trial)
-    unseen = np.any([_unseen(search, row, windows) for row in spreads], axis=0) if spreads else np.zeros(0, bool)
-    if not unseen.any():
+    if not spreads:
         return found
-    question = "in common", trial.terms, trial.optimum.z.tobytes()
-    common = search.once(question, partial(in_common, search, trial, spreads))
+    unseen = np.stack([_unseen(search, row, windows) for row in spreads])
+    for pattern in np.unique(unseen, axis=1).T:  # what is known of the groups of another column stays
+        if not pattern.any():
+            continue
+        gone = [row for row, new in zip(spreads, pattern, strict=True) if new]
+        question = "in common", trial.terms, trial.optimum.z.tobytes(), *gone
+        common = search.once(question, partial(_in_common, search, trial, gone, for_use))
+        here = (unseen == pattern[:, None]).all(axis=0)
+        found = jax.tree.map(partial(_either, here), found, assessor(common.optimum.z, windows))
+    return found
 
-    def each(known: Any, other: Any) -> Any:
-        return np.where(unseen.reshape(-1, *(1,) * (known.ndim - 1)), other, known) if np.ndim(known) else known
 
-    return jax.tree.map(each, found, assessor(common.optimum.z, windows))
+def _in_common(search: Search, trial: Trial, spreads: list[int], for_use: Callable[[Trial], Trial]) -> Trial:
+    return for_use(in_common(search, trial, spreads))
+
+
+def _either(here: np.ndarray, known: Any, other: Any) -> Any:
+    return np.where(here.reshape(-1, *(1,) * (known.ndim - 1)), other, known) if np.ndim(known) else known
 
 
 def _differing(search: Search, trial: Trial) -> list[int]:
