@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
+from simpel_cli.discovery.last_calibration import last_calibration
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed, with_interactions
 from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
-from simpel_cli.discovery.search.by_group.own_parameters import in_common, own_parameters, per_of, spreads_in, with_own
+from simpel_cli.discovery.search.by_group.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.held_out_gate import Gate
-from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, narrowed, too_narrow, translated, widened, within
+from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
 from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
@@ -24,10 +25,8 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, ti
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import ONE_STEP, calibrated_for, suited, windows_for
-from simpel_cli.discovery.search.uses import in_words as in_words_of_use
+from simpel_cli.discovery.search.uses import ONE_STEP
 from simpel_cli.filtering.errors_ahead import Assessor
-from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import outlier_check
 from simpel_cli.filtering.measurements.windows import Windows
@@ -35,7 +34,6 @@ from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, ter
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression
-from simulators.model import Model
 
 
 class Searched(NamedTuple):
@@ -103,53 +101,8 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
             effects = found.effects or effects
         found = _search_in_groups(ground, effects)
-    return _for_use(ground, found, declared, terminal)
-
-
-def _for_use(ground: Ground, found: Searched, declared: Model, terminal: Terminal) -> Searched:
-    """Calibrate the models before and after for what they will be used for (`discovery.for`).
-
-    Before is the simulator as it was declared: one value for all groups, in the ranges that it gives.
-    """
-    use = ground.options.for_ or ONE_STEP
-    search, selection = found.search, found.selection
-    base = selection.base
-    if per := per_of(found.groupings):
-        base = in_common(search, base, spreads_in(search, per))
-    narrow = narrowed(search, {q.name: (q.low, q.high) for q in declared.params})
-    wider = 0.0
-    if narrow is not None:
-        given = {q.name: (q.low, q.high) for q in declared.params}
-        own = search.plan.augmented.model.params
-        search.declared = {q.name: given[q.name] for q in own if given.get(q.name, (q.low, q.high)) != (q.low, q.high)}
-        wider = selection.chosen.optimum.log_evidence - within(search, narrow, selection.chosen).optimum.log_evidence
-        base = within(search, narrow, base)
-
-    def of_use(search: Search, trial: Trial, calibration: Callable[..., Trial]) -> Trial:
-        assessor = found.assessor.of(search.plan)
-        return calibration(search, assessor, trial, begun(assessor, trial.optimum.z, whole), use)
-
-    path, before = selection.path, selection.path[-1]
-    if use != ONE_STEP:
-        whole = windows_for(search.plan, ground.clean.recording, use)
-        late = ground.budget.over(
-            "whether a calibration for the use does as well on other episodes; steps before the last"
-        )
-        base, chosen = (
-            of_use(s, t, calibrated_for if late else suited) for s, t in ((narrow or search, base), (search, before))
-        )
-        between = () if late else path[1:-1]
-        if chosen is not before:  # what is between follows the last
-            path = (*(of_use(search, t, calibrated_for) for t in (*path[:1], *between) if t is not before), chosen)
-    base = base if narrow is None else translated(narrow, search, base)
-    selection = selection._replace(base=base, chosen=path[-1], path=path)
-    found = found._replace(wider=wider, selection=selection)
-    if use == ONE_STEP:
-        return found
-    found = found._replace(for_use=lambda trial: of_use(search, trial, calibrated_for))
-    moved = path[-1] is not before
-    terminal.line(in_words_of_use(use, whole, search.plan.augmented.model.dt, moved=moved), "search")
-    return found
+    last = last_calibration(ground, declared, found.search, found.selection, found.assessor, per_of(found.groupings))
+    return found._replace(**last._asdict())
 
 
 def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Again:

@@ -34,7 +34,7 @@ HALF_TURN = 2.8  # rad: an error of an angle beyond may jump by a turn
 LOST = 1e3  # standard deviations that an error counts where a model runs away
 MOST = 15  # steps
 MOST_ROWS = 20_000  # of a record, evenly spaced windows of a longer one
-MOST_ROWS_AHEAD = 4000  # where the model is for some seconds
+MOST_ROWS_OF_STEP = 4000  # for a model between the first and the last
 MOST_OF_REACH = 4  # times the rows ahead that a window has
 ENOUGH = 1e-4  # of the cost: about a tenth of a nat
 MOST_FOLDS = 5
@@ -102,18 +102,19 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     return Trial(trial.terms, _placed(trial, rows, moved, np.linalg.inv(found.jac.T @ found.jac)))
 
 
-def windows_for(plan: Setup, recording: Recording, use: str | float) -> Windows:
+def windows_for(plan: Setup, recording: Recording, use: str | float, most: int = MOST_ROWS) -> Windows:
     """Return the training windows in which a model is calibrated for a use, evenly spaced ones of a long record.
 
     Args:
         plan: of the search.
         recording: the measurements.
         use: FREE_RUN: as long as their episodes; or how far ahead, s.
+        most: rows of them, about.
     """
-    longest, most = None, MOST_ROWS
+    longest = None
     if use != FREE_RUN:  # the first rows of a window, from which none is so far ahead, are a small part of it
         reach = SETTLE + rows_ahead(use, plan.augmented.model.dt)
-        longest, most = max(plan.windows.y.shape[1], MOST_OF_REACH * reach), MOST_ROWS_AHEAD
+        longest = max(plan.windows.y.shape[1], MOST_OF_REACH * reach)
     return thinned(whole_windows(plan, recording.train, recording.outputs, longest), most)[0]
 
 
