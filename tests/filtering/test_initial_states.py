@@ -1,5 +1,7 @@
 """Windows begin, in a level that nothing measures, where the measured one says; its rates have the model's scale."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,23 @@ def test_a_first_value_that_is_missing_is_guessed_like_a_hidden_one(plan: Setup)
     np.testing.assert_array_equal(after.start[~first, 1], gone.start[~first, 1])
     lost, found = (assessor(plan.start, windows).log_likelihood[first].sum() for windows in (gone, after))
     assert found > lost + 10
+
+
+def test_a_measured_level_may_begin_beyond_its_range(plan: Setup) -> None:
+    """A range is what was expected; the value that is missing is guessed from those behind it, wherever they are."""
+    high = plan.augmented.model.states[1]
+    narrow = replace(plan.augmented.model, states=(plan.augmented.model.states[0], high._replace(high=6.0)))
+    small = plan._replace(augmented=plan.augmented._replace(model=narrow))
+    ok = plan.windows.ok.copy()
+    first = plan.windows.begin == 0
+    ok[first, 0, 0] = 0.0
+    after = begun(Assessor(small, 5), plan.start, plan.windows._replace(ok=ok))
+    assert (after.start[first, 1] > 6.0).any()
+
+
+def test_whole_windows_begin_as_wide_as_those_of_the_search_did(plan: Setup) -> None:
+    """A better guess in the first window says nothing of other windows."""
+    close = plan.windows._replace(spread=0.1 * plan.windows.spread)
+    episodes = [Episode("e", np.arange(20) * DT, np.full((20, 2), 10.0), np.zeros((20, 0)), np.zeros((20, 0)))]
+    whole = whole_windows(plan._replace(windows=close), episodes, ())
+    np.testing.assert_array_equal(whole.spread[0], plan.windows.spread[0])
