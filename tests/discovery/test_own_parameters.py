@@ -14,9 +14,13 @@ from command_line import simpel
 from test_effects_by_group import CART, DATA
 
 from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.search.by_group import strangers
 from simpel_cli.discovery.search.by_group.own_parameters import _can_differ, with_own, written
+from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.smaller import small_search
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.errors import ConfigError
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.setup import setup
 from simpel_cli.studies.open import _grouped
@@ -88,7 +92,7 @@ def test_a_force_of_every_rig_that_is_none_on_average(tmp_path: Path) -> None:
         assert own["value"] == pytest.approx(truth[name]["f"], abs=0.02)
 
 
-def test_groups_of_two_columns_and_what_was_never_seen() -> None:
+def test_groups_of_two_columns_and_what_was_never_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every group has the windows of its own column, in whatever order parameters came to differ; no data tell of `another`."""
     model = Declared(
         "m", dt=0.1, states={"x": {"unit": "m", "range": [-3, 3]}}, inputs={"u": {"range": [-2, 2], "between_rows": "held"}},
@@ -125,6 +129,28 @@ def test_groups_of_two_columns_and_what_was_never_seen() -> None:
     another = [names.index(f"{q}_of_another") for q in "ab"]
     assert len(begun) > 4
     assert all(list(h.z[another]) == [0.5, 0.5] for h in begun)  # the middle of the population
+    # of a rig that was never seen, on days that were, what is known of the days stays
+    windows, gone = search.plan.windows, list[list[str]]()
+    u = windows.u.copy()
+    new = windows.episode == 0
+    rigs = [j for j, q in enumerate(source.inputs) if q.name.startswith("rig_is_")]
+    u[np.ix_(np.flatnonzero(new), range(u.shape[1]), rigs)] = [0.0, 0.0, 1.0]
+    free = tuple(i for i, name in enumerate(names) if i not in another and not name.endswith("_spread"))
+    z = np.where(
+        [name.endswith("_spread") for name in names] + [False] * (len(search.plan.start) - len(names)), 0.3, 0.6
+    )
+    trial = Trial((), Optimum(z, free, 0.0, 0.0, np.zeros(0), np.eye(0), np.zeros(0), np.eye(0), 1, True))
+
+    def common(search: Search, trial: Trial, spreads: Sequence[int]) -> Trial:
+        gone.append([names[row] for row in spreads])
+        return trial._replace(optimum=trial.optimum._replace(z=np.full_like(z, 0.4)))
+
+    monkeypatch.setattr(strangers, "in_common", common)
+    assessor = Assessor(search.plan, 5)
+    known, found = assessor(z, windows._replace(u=u)), assessed(search, assessor, trial, windows._replace(u=u))
+    assert gone == [["b_spread"]]
+    np.testing.assert_array_equal(found.one_step[~new], known.one_step[~new])
+    assert np.nanmax(np.abs(found.one_step[new] - known.one_step[new])) > 0
 
 
 def test_parameters_that_cannot_differ_are_not_asked_about() -> None:

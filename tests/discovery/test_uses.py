@@ -1,13 +1,19 @@
 """The last calibration is for the use that is named."""
 
+from io import StringIO
 from typing import Any
 
 import numpy as np
 import pytest
-from test_ranges import measured, searched
+from test_ranges import cart, measured, searched
 
 from simpel_cli.config.build import build
+from simpel_cli.discovery import last_calibration as last
+from simpel_cli.discovery.ground import Ground
+from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.uses import (
     FREE_RUN,
     ONE_STEP,
@@ -17,9 +23,12 @@ from simpel_cli.discovery.search.uses import (
     suited,
     windows_for,
 )
+from simpel_cli.discovery.watch import Watch
 from simpel_cli.errors import ConfigError
 from simpel_cli.filtering.errors_ahead import Assessor, rmse
+from simpel_cli.filtering.measurements.cleaning import Cleaned
 from simpel_cli.filtering.setup import whole_windows as held_out
+from simpel_cli.runs.console import Terminal
 
 
 @pytest.mark.parametrize("use", [FREE_RUN, 1.0])
@@ -115,3 +124,31 @@ def test_windows_are_long_against_what_the_model_is_for() -> None:
     too_far = (rows + 1) * dt
     words = in_words(too_far, windows_for(plan, recording, too_far), dt, moved=False)
     assert words == f"not calibrated for {too_far:g} s ahead: no training episode is so long"
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_out_of_time_models_are_calibrated_for_their_use_without_asking_other_episodes(
+    late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording, lines = measured(1.2, k=0.3), StringIO()
+    search = searched(recording, [])
+    base, budget = search.base(), Budget(1.0 if late else None, iter([0.0, *[2.0] * 99]).__next__)
+    terminal = Terminal(quiet=True)
+    monkeypatch.setattr(terminal, "line", lambda text, *_: lines.write(f"{text}\n"))
+    asked = list[Trial]()
+
+    def asking(search: Search, assessor: Assessor, trial: Trial, *given: Any) -> Trial:
+        asked.append(trial)
+        return suited(search, assessor, trial, *given)
+
+    monkeypatch.setattr(last, "suited", asking)
+    ground = Ground(cart(), Cleaned(recording, (), {}), Discovery(for_=FREE_RUN), (), terminal, budget, Watch(budget))
+    found = last.last_calibration(
+        ground, cart(), search, Selection(base, base, (base,), (), (), (), None), Assessor(search.plan, 10), {}
+    )
+    assert len(asked) == (0 if late else 2)
+    assert budget.left_out == ([last.LATE] if late else [])
+    assert found.selection.chosen is found.selection.path[-1]
+    assert found.selection.chosen.optimum.z[0] != base.optimum.z[0]  # without a drag it simulates better elsewhere
+    assert lines.getvalue() == "calibrated for free_run\n"
+    np.testing.assert_allclose(found.for_use(base).optimum.z, found.selection.chosen.optimum.z)
