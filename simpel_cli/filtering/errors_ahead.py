@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from simpel_cli.filtering.independent_parts import NO_PART, per_channel
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.filter import MOST_KEPT
 from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, no_jumps
 from simpel_cli.filtering.likelihood.track import Filter, Track
-from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.programs import Program
 
-BLOCKS = 10  # of a test window, where there are few episodes
 RAN_AWAY = 1e3  # times the other model's error, where a model has none
 SETTLE = 5  # rows after which the filter knows a state that it started without
 FIRST = 6  # rows from which it is estimated where a free run begins
@@ -128,25 +128,35 @@ def rmse(error: np.ndarray) -> np.ndarray:
 def reduction_interval(
     before: np.ndarray,
     after: np.ndarray,
-    episode: np.ndarray,
+    parts: np.ndarray,
     random: np.random.Generator,
     draws: int = 4000,
     level: float = 0.95,
 ) -> np.ndarray:
-    """Return intervals of RMSE before / RMSE after, (2, ny), by resampling whole episodes.
+    """Return intervals of RMSE before / RMSE after, (2, ny), by resampling whole parts; NaN: there is none.
+
+    Args:
+        before: errors of one model, (W, T, ny).
+        after: of the other.
+        parts: of which episode, say, each window is, (W,); or per channel, (W, ny), as of `independent_parts`.
+        random: generator.
+        draws: resampled sets.
+        level: probability of the interval.
 
     Reference: Efron and Tibshirani (1993), An introduction to the bootstrap, ch. 8.
     """
     before, after = with_lost(before, after)
-    names = np.unique(episode)
-    sums = [[np.nansum(e[episode == n] ** 2, axis=(0, 1)) for n in names] for e in (before, after)]
-    first, second = (np.stack(s) for s in sums)
-    chosen = random.integers(0, len(names), (draws, len(names)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
-    measured = np.isfinite(ratio).any(axis=0)  # a channel that nothing measured has no interval
-    interval = np.full((2, ratio.shape[1]), np.nan)
-    interval[:, measured] = np.nanquantile(ratio[:, measured], [(1 - level) / 2, (1 + level) / 2], axis=0)
+    interval = np.full((2, before.shape[2]), np.nan)
+    for j, own in enumerate(per_channel(parts, before.shape[2])):
+        names = np.unique(own[own != NO_PART])
+        if not len(names):
+            continue
+        first, second = (np.array([np.nansum(e[own == n, :, j] ** 2) for n in names]) for e in (before, after))
+        chosen = random.integers(0, len(names), (draws, len(names)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.sqrt(first[chosen].sum(axis=1) / second[chosen].sum(axis=1))
+        if np.isfinite(ratio).any():  # a channel that nothing measured has no interval
+            interval[:, j] = np.nanquantile(ratio, [(1 - level) / 2, (1 + level) / 2])
     return interval
 
 
@@ -158,21 +168,6 @@ def with_lost(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.nda
         size = np.sqrt(np.mean(other[known] ** 2)) if known.any() else 0.0
         found.append(np.where(~np.isfinite(own) & known, RAN_AWAY * size, own))
     return found[0], found[1]
-
-
-def in_parts(errors: np.ndarray, episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (W, T, ny) of test windows with the number of the part that each is of, for intervals by resampling.
-
-    Parts are episodes; of one or two of them, which have no interval, blocks of rows: (W BLOCKS, rows, ny), (W BLOCKS,).
-
-    Reference: Kuensch (1989), The jackknife and the bootstrap for general stationary observations.
-    """
-    if len(np.unique(episode)) >= LEAST_EPISODES:
-        return errors, np.unique(episode, return_inverse=True)[1]
-    windows, rows, ny = errors.shape
-    length = -(-rows // BLOCKS)
-    padded = np.concatenate([errors, np.full((windows, BLOCKS * length - rows, ny), np.nan)], axis=1)
-    return padded.reshape(windows * BLOCKS, length, ny), np.arange(windows * BLOCKS)
 
 
 def gain_interval(gain: np.ndarray, random: np.random.Generator, draws: int = 4000) -> tuple[float, float]:

@@ -18,7 +18,6 @@ from simpel_cli.discovery.search.uses import (
     FREE_RUN,
     ONE_STEP,
     calibrated_for,
-    correlation_time,
     in_words,
     suited,
     windows_for,
@@ -59,16 +58,6 @@ def test_the_right_model_stays_where_it_is() -> None:
     windows = held_out(search.plan, recording.train, ())
     suited = calibrated_for(search, assessor, base, windows, FREE_RUN)
     assert suited.optimum.z[0] == pytest.approx(base.optimum.z[0], abs=2e-3)
-
-
-def test_correlation_time_of_an_autoregression() -> None:
-    random = np.random.default_rng(0)
-    e = random.normal(size=(40, 500, 1))
-    for k in range(1, 500):
-        e[:, k] += 0.8 * e[:, k - 1]
-    assert correlation_time(e) == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.15)
-    assert correlation_time(random.normal(size=(40, 500, 1))) == pytest.approx(1.0, abs=0.05)
-    assert correlation_time(np.full((2, 5, 1), np.nan)) == 1.0
 
 
 @pytest.mark.parametrize("given", ["free_run", "one_step", 0.5, 2, None])

@@ -261,7 +261,7 @@ def growing(
         before: errors of every measured channel without an effect, at every horizon.
         after: with it.
         measured: names of the channels, ny.
-        groups: of which part each window is, (W,); or by horizon.
+        groups: of which part each window is, (W,) or per channel (W, ny); or these by horizon.
     """
     of = groups if isinstance(groups, Mapping) else dict.fromkeys(before, groups)
     random = np.random.default_rng(1)

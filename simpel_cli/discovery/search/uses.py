@@ -22,6 +22,7 @@ from scipy.optimize import least_squares
 from simpel_cli.data import Recording
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import SETTLE, Assessor, with_lost
+from simpel_cli.filtering.independent_parts import correlation_time
 from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, thinned
 from simpel_cli.filtering.setup import Setup, whole_windows
@@ -38,7 +39,6 @@ MOST_ROWS_OF_STEP = 4000  # for a model between the first and the last
 MOST_OF_REACH = 4  # times the rows ahead that a window has
 ENOUGH = 1e-4  # of the cost: about a tenth of a nat
 MOST_FOLDS = 5
-CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
 
 Errors = Callable[[np.ndarray], np.ndarray]  # (models, n) -> (models, W, T, ny)
 
@@ -63,7 +63,7 @@ def calibrated_for(search: Search, assessor: Assessor, trial: Trial, windows: Wi
     errors = _errors_of(assessor, windows, use, search.plan.augmented.model.dt)
     z = trial.optimum.z
     before = errors(z[None])[0]
-    tau = correlation_time(before)
+    tau = _memory(before)
     sigma = _sizes(before)
     there = np.isfinite(windows.y) & (windows.ok > 0) & np.isfinite(before) & (sigma > 0)
     sigma = np.where(sigma > 0, sigma, 1.0)
@@ -170,19 +170,11 @@ def suited(search: Search, assessor: Assessor, trial: Trial, windows: Windows, u
     return calibrated_for(search, assessor, trial, windows, use) if better else trial
 
 
-def correlation_time(errors: np.ndarray) -> float:
-    """Return the mean over channels of the integrated autocorrelation time of errors (W, T, ny), rows, at least 1."""
-    found = []
-    for j in range(errors.shape[2]):
-        e = np.where(np.isfinite(errors[..., j]), errors[..., j], 0.0)
-        rows = e.shape[1]
-        lags = np.array([np.sum(e[:, : rows - k] * e[:, k:]) for k in range(rows)])
-        if not lags[0] > 0:
-            continue
-        r = lags / lags[0]
-        end = int(np.argmax(r < CORRELATED)) or rows
-        found.append(1 + 2 * float(r[1:end].sum()))
-    return max(float(np.mean(found)), 1.0) if found else 1.0
+def _memory(errors: np.ndarray) -> float:
+    """Return the mean over channels of the correlation time of errors (W, T, ny), rows, at least 1."""
+    there = np.isfinite(errors) & (errors != 0)
+    seen = [j for j in range(errors.shape[2]) if there[..., j].any()]
+    return float(np.mean([correlation_time(errors[..., j]) for j in seen])) if seen else 1.0
 
 
 def _placed(trial: Trial, rows: list[int], z: np.ndarray, covariance: np.ndarray) -> Any:

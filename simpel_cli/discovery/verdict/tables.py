@@ -9,7 +9,8 @@ from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import before_of, interval_of
-from simpel_cli.filtering.errors_ahead import Assessment, in_parts
+from simpel_cli.filtering.errors_ahead import Assessment
+from simpel_cli.filtering.independent_parts import NO_PART, independent_parts
 from simpel_cli.filtering.likelihood.latent_force import Force
 from simpel_cli.filtering.measurements.windows import Windows, pieces
 from simulators.groups import MEMBER, SPREAD
@@ -123,7 +124,7 @@ def trajectory_columns(
 def error_columns(
     before: Assessment, after: Assessment, windows: Windows, measured: Mapping[str, str], noise: Mapping[str, float]
 ) -> Columns:
-    """Return RMSE before and after by horizon with 95 % intervals, by resampling the parts of the test (`in_parts`).
+    """Return RMSE before and after by horizon with 95 % intervals, by resampling the parts of the test (`independent_parts`).
 
     Args:
         before: the calibrated simulator on the windows.
@@ -134,33 +135,41 @@ def error_columns(
     """
     rows: list[dict[str, Any]] = []
     for horizon in HORIZONS:
-        pair = [{"one_step": a.one_step, "horizon": a.ahead, "free_run": a.free}[horizon] for a in (before, after)]
-        cut = [in_parts(e, windows.episode) for e in pair]
-        there = np.isfinite([e for e, _ in cut]).any(axis=(0, 2, 3))  # a shorter episode is padded
-        names = np.unique(cut[0][1][there]) if there.any() else np.unique(cut[0][1])
-        chosen = np.random.default_rng(3).integers(0, len(names), (DRAWS, len(names)))
-        sums = [np.stack([_squares(e[parts == n]) for n in names]) for e, parts in cut]
-        whole = [_root(s.sum(axis=0)) for s in sums]
-        drawn = [_root(s[chosen].sum(axis=1)) for s in sums]
+        one, other = (
+            {"one_step": a.one_step, "horizon": a.ahead, "free_run": a.free}[horizon] for a in (before, after)
+        )
+        first, second, parts = independent_parts(one, other, windows.episode)
         for j, (name, unit) in enumerate(measured.items()):
             row = {"horizon": horizon, "output": name, "unit": unit, "noise_floor": noise[name]}
-            row |= _estimate("before", whole[0][j], drawn[0][:, j])
-            row |= _estimate("after", whole[1][j], drawn[1][:, j])
+            whole, drawn = _resampled([e[..., j] for e in (first, second)], parts[:, j])
+            row |= _estimate("before", whole[0], drawn[0])
+            row |= _estimate("after", whole[1], drawn[1])
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratio, ratios = whole[0][j] / whole[1][j], drawn[0][:, j] / drawn[1][:, j]
-            rows.append(row | _estimate("reduction", ratio, ratios))
+                rows.append(row | _estimate("reduction", whole[0] / whole[1], drawn[0] / drawn[1]))
     return as_columns(rows)
 
 
+def _resampled(errors: Sequence[np.ndarray], parts: np.ndarray) -> tuple[list[float], list[np.ndarray]]:
+    """Return the RMSE of errors (N, T) of each model, and of resampled parts (N,), (DRAWS,) or, without parts, (0,)."""
+    there = np.isfinite(errors).any(axis=(0, 2))  # a shorter episode is padded
+    whole = [_root(_squares(e)) for e in errors]
+    names = np.unique(parts[there])
+    if not len(names) or names[0] == NO_PART:
+        return [float(r) for r in whole], [np.zeros(0)] * len(errors)
+    chosen = np.random.default_rng(3).integers(0, len(names), (DRAWS, len(names)))
+    sums = [np.stack([_squares(e[parts == n]) for n in names]) for e in errors]
+    return [float(r) for r in whole], [_root(s[chosen].sum(axis=1)) for s in sums]
+
+
 def _squares(error: np.ndarray) -> np.ndarray:
-    """Sum of squares and number of errors, (2, ny)."""
-    return np.stack([np.nansum(error**2, axis=(0, 1)), np.isfinite(error).sum(axis=(0, 1))])
+    """Sum of squares and number of errors, (2,)."""
+    return np.array([np.nansum(error**2), np.isfinite(error).sum()])
 
 
-def _root(sums: np.ndarray) -> np.ndarray:
-    """Return the root mean square of (..., 2, ny) sums; NaN where there is nothing."""
+def _root(sums: np.ndarray) -> Any:
+    """Return the root mean square (...,) of (..., 2) sums; NaN where there is nothing."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.sqrt(sums[..., 0, :] / sums[..., 1, :])
+        return np.sqrt(sums[..., 0] / sums[..., 1])
 
 
 def _estimate(name: str, value: float, drawn: np.ndarray) -> dict[str, float]:

@@ -7,14 +7,15 @@ import numpy as np
 
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.by_group.strangers import assessed
-from simpel_cli.discovery.search.held_out_gate import AHEAD, Errors, Gate, errors_of, growing
+from simpel_cli.discovery.search.held_out_gate import AHEAD, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
 from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
-from simpel_cli.filtering.errors_ahead import Assessment, Assessor, in_parts, reduction_interval, results, rmse
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
+from simpel_cli.filtering.independent_parts import independent_parts
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of
 from simulators.groups import MEMBER, SPREAD
@@ -67,8 +68,12 @@ def verdict_of(
             remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon),
         )
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
-    first, second, parts = _parts(before, after, windows)
-    interval = reduction_interval(first[AHEAD["ahead"]], second[AHEAD["ahead"]], parts, np.random.default_rng(2))
+    pairs = {
+        words: independent_parts(e, errors_of(after)[words], windows.episode) for words, e in errors_of(before).items()
+    }
+    ahead = pairs[AHEAD["ahead"]]
+    interval = reduction_interval(ahead.before, ahead.after, ahead.parts, np.random.default_rng(2))
+    first, second, parts = ({words: pair[k] for words, pair in pairs.items()} for k in range(3))
     grows = growing(first, second, measured, parts)
     found = {
         "verdict": kind,
@@ -111,15 +116,6 @@ def verdict_of(
     }
     warning = f" With it the test error of {' and of '.join(grows)} grows." if grows else ""
     return found | {"summary": sentence(found, before, after, measured) + warning}
-
-
-def _parts(before: Assessment, after: Assessment, windows: Windows) -> tuple[Errors, Errors, np.ndarray]:
-    """Return errors without and with the effects, by horizon, and of which part of the test each window is."""
-    first, second = (
-        {words: in_parts(e, windows.episode) for words, e in errors_of(found).items()} for found in (before, after)
-    )
-    parts = first[AHEAD["ahead"]][1]
-    return {k: e for k, (e, _) in first.items()}, {k: e for k, (e, _) in second.items()}, parts
 
 
 def steps_of(
