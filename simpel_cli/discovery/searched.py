@@ -14,7 +14,7 @@ from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, g
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
 from simpel_cli.discovery.search.by_group.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
-from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.gate.held_out import Gate
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut

@@ -103,7 +103,7 @@ def test_errors_fall_and_free_runs_are_named(shown: dict[str, EvidenceTable]) ->
     assert set(runs["episode"]) == {"4"}
     errors, _ = shown["errors"]
     assert errors["output"].tolist() == ["s", "v"] * 3
-    # one test episode: the intervals are those of its blocks
-    assert (errors["reduction_low"] < errors["reduction"]).all()
-    assert (errors["reduction"] < errors["reduction_high"]).all()
+    np.testing.assert_allclose(errors["reduction"], errors["before"] / errors["after"])
+    # one short test episode, through which the errors remember: no intervals
+    assert np.isnan(errors["reduction_low"]).all()
     assert {"before", "after"} == set(shown["innovations"].columns["model"])

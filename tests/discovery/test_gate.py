@@ -11,7 +11,7 @@ from test_ranges import cart
 from test_ranges import searched as measured_search
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.held_out_gate import (
+from simpel_cli.discovery.search.gate.held_out import (
     AHEAD,
     LEAST_BLOCKS,
     LEAST_OF_BLOCK,

@@ -17,7 +17,7 @@ from simpel_cli.discovery.ground import Ground
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.by_group import grouping as grouping_module
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, sentence_of
-from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.gate.held_out import Gate
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.memories import Memory
 from simpel_cli.discovery.searched import Again, Searched

@@ -4,7 +4,7 @@ import numpy as np
 from test_pairs import CUBIC, LINEAR, carts
 from test_ranges import cart, searched
 
-from simpel_cli.discovery.search.harm import growing_for
+from simpel_cli.discovery.search.gate.harm import growing_for
 from simpel_cli.filtering.errors_ahead import Assessor
 
 

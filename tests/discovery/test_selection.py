@@ -18,7 +18,7 @@ from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gate
 from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated
-from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.gate.held_out import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward, merging
@@ -428,6 +428,29 @@ def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.Monk
     )
     assert kept.chosen.terms == ()
     assert judged == []
+
+
+@pytest.mark.parametrize(("few", "left"), [(True, "A"), (False, "AB")])
+def test_what_few_held_out_parts_cannot_tell_stays_unless_it_explains_a_few_places_alone(
+    few: bool, left: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    search: Any = Table({"": 0.0, "A": 60.0, "B": 40.0, "AB": 100.0}).search
+    found = select(search)
+
+    def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
+        names = [search.terms[t].effect for t in whole.terms] if len(parts) == len(whole.terms) else ["both"]
+        return [Gate(30.0, -1.0 if n == "B" else 5.0, 70.0, "episode", False, n != "B") for n in names]
+
+    def by_row(_: Any, __: Any, whole: Trial, part: Trial) -> np.ndarray:
+        assert [search.terms[t].effect for t in set(whole.terms) - set(part.terms)] == ["B"]
+        gains = np.zeros((3, 50))
+        gains[:, 0 :: 50 if few else 10] = 4.0
+        return gains
+
+    monkeypatch.setattr(acceptance, "gates", judge)
+    monkeypatch.setattr(acceptance, "_by_row", by_row)
+    kept, *_ = gated_selection(search, Assessor(search.plan, 5), found, Terminal(True, tmp_path / "run.log"))
+    assert sorted(search.terms[t].effect for t in kept.chosen.terms) == list(left)
 
 
 @pytest.mark.parametrize(("helps", "gain"), [(True, 5.0), (False, 5.0), (True, -5.0)])

@@ -4,9 +4,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
+import numpy as np
+
 from simpel_cli.discovery.search.again import Earlier, path_in
-from simpel_cli.discovery.search.harm import growing_for
-from simpel_cli.discovery.search.held_out_gate import Gate, gates
+from simpel_cli.discovery.search.gate.few_places import in_few_places
+from simpel_cli.discovery.search.gate.harm import growing_for
+from simpel_cli.discovery.search.gate.held_out import Gate, gates, score
 from simpel_cli.discovery.search.near import far
 from simpel_cli.discovery.search.sets.forward import condensed, further, selected, widely
 from simpel_cli.discovery.search.sets.rivals import rivalled
@@ -123,7 +126,8 @@ def gated_selection(
     Effects that are of use only together, as a delay and a slip, are judged together so. Of those that do harm the one goes
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
-    member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps.
+    member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps,
+    unless its evidence comes from a few places of the recording.
     And where others fall with one that was not certain, they stay together if together they surely help beside what is left:
     an overflow may do harm without the outflow that belongs to it.
     Where a use is named, harm is what is left of it with both models calibrated for that.
@@ -145,10 +149,12 @@ def gated_selection(
                 harmless = grows is not None and not grows
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
-        if len(parts) > 1 and failed and all(_helps(judged[i], selection.gains[i]) for i in failed):
+        earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
+        acts = {i for i in earned if not in_few_places(_by_row(search, assessor, chosen, parts[i]), STRONG)}
+        if len(parts) > 1 and failed and all(i in acts and judged[i].gain > CARRIED * earned[i] for i in failed):
             (beside_none,) = gates(search, assessor, chosen, [selection.base])
             failed = [] if beside_none.passed else failed
-        strong = all(not judged[i].harm and judged[i].gain > 0 and selection.gains[i] > STRONG for i in failed)
+        strong = all(i in acts and judged[i].gain > 0 for i in failed)
         if whole is None and not harmful and failed and strong:
             whole = selection, judged
         harm = [i for i in failed if judged[i].harm]
@@ -170,9 +176,11 @@ def gated_selection(
     return selection, judged if selection.chosen.terms else [], harmful
 
 
-def _helps(judged: Gate, earned: float) -> bool:
-    """Whether an effect that is not certain to help helps on the whole, with strong evidence and without harm."""
-    return not judged.harm and judged.gain > CARRIED * earned and earned > STRONG
+def _by_row(search: Search, assessor: Assessor, chosen: Trial, part: Trial) -> np.ndarray:
+    """Return what a model gains over another in every row that both were fitted to, nats, (W, T)."""
+    windows = search.plan.windows
+    with_it, without = (score(assessor(t.optimum.z, windows), windows) for t in (chosen, part))
+    return np.asarray(with_it - without)
 
 
 def with_interactions(

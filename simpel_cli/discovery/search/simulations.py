@@ -12,7 +12,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
 from simpel_cli.discovery.search.again import Earlier, path_in
-from simpel_cli.discovery.search.held_out_gate import Gate
+from simpel_cli.discovery.search.gate.held_out import Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery

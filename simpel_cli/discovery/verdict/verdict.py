@@ -7,7 +7,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.by_group.strangers import assessed
-from simpel_cli.discovery.search.held_out_gate import AHEAD, Gate, errors_of, growing
+from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from simpel_cli.discovery.search.held_out_gate import Gate, gates
+from simpel_cli.discovery.search.gate.held_out import Gate, gates
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, small_search

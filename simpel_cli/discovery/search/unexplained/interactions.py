@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.held_out_gate import Gate, gates
+from simpel_cli.discovery.search.gate.held_out import Gate, gates
 from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from simpel_cli.discovery.search.held_out_gate import AMPLE, Errors, errors_of, growing
+from simpel_cli.discovery.search.gate.held_out import AMPLE, Errors, errors_of, growing
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.uses import calibrated_for
 from simpel_cli.filtering.errors_ahead import Assessor

@@ -143,10 +143,10 @@ def _of_blocks(
         fits = fitter([Hypothesis(t.optimum.z, t.optimum.free, search.ones) for t in trials])
         for i, fitted in enumerate(fits):
             found = assessor(fitted.z, windows)
-            score = _score(found, windows)
+            scores = score(found, windows)
             for b in np.flatnonzero(fold == k):
                 w, rows = np.argwhere(blocks[b])[0, 0], blocks[b].any(axis=0)
-                likelihood[i][b] = score[w, rows].sum()
+                likelihood[i][b] = scores[w, rows].sum()
                 for name, words in AHEAD.items():
                     errors[i][words][b, rows] = getattr(found, name)[w, rows]
     return likelihood, errors, np.arange(len(blocks))
@@ -176,7 +176,7 @@ def _blocks(windows: Windows) -> list[np.ndarray]:
     return found
 
 
-def _score(found: Assessment, windows: Windows) -> np.ndarray:
+def score(found: Assessment, windows: Windows) -> np.ndarray:
     """Log-likelihood of every row, (W, T), far down where the model ran away."""
     ok = windows.ok > 0
     e, s = found.track.innovation, found.variance
