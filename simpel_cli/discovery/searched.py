@@ -1,6 +1,7 @@
 """A whole search: in clean measurements, with the inputs between rows and the differences between groups that it finds."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_i
 from simpel_cli.discovery.search.by_group.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.gate.held_out import Gate
+from simpel_cli.discovery.search.integration import Finer, too_coarse
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
 from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
@@ -96,6 +98,10 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
                 simulated=found.simulated or ground.simulated,
                 remembering=tuple(terms),
             )
+        elif isinstance(found, Finer):
+            terminal.line(f"these effects ask for {found.steps} integration steps a row: searching once more", "steps")
+            options = replace(ground.options, substeps=found.steps)
+            ground = ground._replace(options=options, earlier=found.earlier)
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
@@ -105,7 +111,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
     return found._replace(**last._asdict())
 
 
-def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Again:
+def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Finer | Again:
     """Search; once more with the effects that differ from group to group, as long as that pays.
 
     A state that nobody measures may stand for what differs from group to group, which is the simpler cause: it is asked last.
@@ -120,7 +126,9 @@ def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | W
     return found.again._replace(effects=effects)
 
 
-def _settled_in_groups(ground: Ground, effects: list[Expression]) -> tuple[Searched | Wider | Again, list[Expression]]:
+def _settled_in_groups(
+    ground: Ground, effects: list[Expression]
+) -> tuple[Searched | Wider | Finer | Again, list[Expression]]:
     """Do so; also returns the effects as they were searched for in the end."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
@@ -145,7 +153,7 @@ def _settled_in_groups(ground: Ground, effects: list[Expression]) -> tuple[Searc
 
 def _search(
     ground: Ground, effects: list[Expression], settled: list[Grouping] | None = None
-) -> Searched | Wider | Again:
+) -> Searched | Wider | Finer | Again:
     """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
 
     Args:
@@ -161,7 +169,7 @@ def _search(
             terminal.line(grouping_in_words(one), "groups")
     while True:
         found = _with(ground, effects, own, ask=settled is None)
-        if isinstance(found, Searched | Wider | Again):
+        if isinstance(found, Searched | Wider | Finer | Again):
             return found
         own, earlier = found
         settled, ground = own, ground._replace(earlier=earlier)
@@ -178,15 +186,15 @@ class _Heavy(NamedTuple):
 
 
 def _chosen_in(
-    found: Calibrated, assessor: Assessor, ground: Ground, wider: Callable[[Search, Trial], Wider | None],
+    found: Calibrated, assessor: Assessor, ground: Ground, unsound: Callable[[Search, Selection], Wider | Finer | None],
     earlier: Earlier | None = None,
-) -> tuple[Calibrated, Selection, list[Gate]] | Wider:  # fmt: skip
-    """Search and judge; nothing is judged on held-out episodes beside ranges that are too narrow, or the wrong noise."""
+) -> tuple[Calibrated, Selection, list[Gate]] | Wider | Finer:  # fmt: skip
+    """Search and judge; nothing is judged on held-out episodes in ranges too narrow, steps too coarse, or the wrong noise."""
     options = ground.options
 
-    def wrong(selection: Selection) -> Wider | _Heavy | None:
-        if (ends := wider(found.search, selection.chosen)) is not None:
-            return ends._replace(earlier=chosen_of(found, selection))
+    def wrong(selection: Selection) -> Wider | Finer | _Heavy | None:
+        if (first := unsound(found.search, selection)) is not None:
+            return _told(first, found, selection)
         heavy = None if beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
         return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
 
@@ -196,7 +204,7 @@ def _chosen_in(
     while True:
         selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
         outcome = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP, wrong)
-        if isinstance(outcome, Wider):
+        if isinstance(outcome, Wider | Finer):
             return outcome
         if not isinstance(outcome, _Heavy):
             return found, *outcome
@@ -217,6 +225,11 @@ def _with_tails(found: Calibrated, assessor: Assessor, trial: Trial, ground: Gro
     return heavy
 
 
+def _told(first: Wider | Finer, found: Calibrated, selection: Selection) -> Wider | Finer:
+    """Return what has to be known first, with what was chosen without it; finer steps ask only what stands beside that."""
+    return first._replace(earlier=chosen_of(found, selection)._replace(settled=isinstance(first, Finer)))
+
+
 def chosen_of(found: Calibrated | Searched, selection: Selection) -> Earlier:
     """Return what a search has chosen, for one that is made after it."""
     return Earlier(found.search, selection.chosen, heavy=bool(found.degrees_of_freedom))
@@ -224,7 +237,7 @@ def chosen_of(found: Calibrated | Searched, selection: Selection) -> Earlier:
 
 def _with(
     ground: Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
-) -> Searched | Wider | Again | tuple[list[Grouping], Earlier]:
+) -> Searched | Wider | Finer | Again | tuple[list[Grouping], Earlier]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:
@@ -245,6 +258,13 @@ def _with(
     def wider(search: Search, trial: Trial) -> Wider | None:
         late = ground.wider == MOST_WIDER or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
         return None if late else too_narrow(search, trial)
+
+    def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
+        chosen = selection.chosen
+        finer = too_coarse(search, assessor, chosen, selection.base) if options.substeps is None else None
+        if finer is not None and not ground.budget.over("finer integration steps"):
+            return finer
+        return wider(search, chosen)
 
     def fitter(plan: Setup) -> Fitter:
         found = fitter_of(plan, options.lanes, options.room + members(plan))
@@ -267,8 +287,8 @@ def _with(
         # a state that is missing may be what a parameter at the end of its range makes up for
         promising = remembering(at_base := NoiseProfile(found.search, assessor, found.base), at_base)
         return Again(promising[0], None) if promising and promising[0].gain > ends.gain - TIE else ends
-    outcome = _chosen_in(found, assessor, ground, wider, ground.earlier)
-    if isinstance(outcome, Wider):
+    outcome = _chosen_in(found, assessor, ground, unsound, ground.earlier)
+    if isinstance(outcome, Wider | Finer):
         return outcome
     found, selection, gates = outcome
     said, chosen = words_of(between_rows), selection.chosen
@@ -278,8 +298,8 @@ def _with(
         terminal.line(f"beside these effects {in_words(between_rows)}: searching once more", "inputs")
         plan, earlier = attach(saying(model, between_rows), kept=kept), chosen_of(found, selection)
         assessor, found = begun_in(plan)
-        outcome = _chosen_in(found, assessor, ground, wider, earlier)
-        if isinstance(outcome, Wider):
+        outcome = _chosen_in(found, assessor, ground, unsound, earlier)
+        if isinstance(outcome, Wider | Finer):
             return outcome
         found, selection, gates = outcome
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
@@ -290,13 +310,13 @@ def _with(
     while True:
         judged = selection.chosen.terms
         selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
-        if selection.chosen.terms != judged and (ends := wider(found.search, selection.chosen)) is not None:
-            return ends._replace(earlier=chosen_of(found, selection))
+        if selection.chosen.terms != judged and (first := unsound(found.search, selection)) is not None:
+            return _told(first, found, selection)
         heavy = _heavy(found, assessor, selection, ground)  # which rivals may have been needed to tell
         if heavy is None:
             break
-        outcome = _chosen_in(heavy, assessor, ground, wider, chosen_of(found, selection))
-        if isinstance(outcome, Wider):
+        outcome = _chosen_in(heavy, assessor, ground, unsound, chosen_of(found, selection))
+        if isinstance(outcome, Wider | Finer):
             return outcome
         found, selection, gates = outcome
     search, windows = found.search, found.test

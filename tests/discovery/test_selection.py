@@ -19,6 +19,7 @@ from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated
 from simpel_cli.discovery.search.gate.held_out import Gate
+from simpel_cli.discovery.search.integration import Finer
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.score_test import Score
 from simpel_cli.discovery.search.sets import forward, merging
@@ -733,19 +734,20 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searched_module, "beaten", lambda *_: False)
 
 
+@pytest.mark.parametrize("first", [Wider({"k": (0.0, 2.0)}, 9.0), Finer(4)])
 @pytest.mark.parametrize(
     ("asks", "kept", "questions"),
     [("proposed", 1, ["proposed"]), ("judged", 0, ["proposed", "judged"]), ("", 1, ["proposed"])],
 )
-def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refused(
-    asks: str, kept: int, questions: list[str], monkeypatch: pytest.MonkeyPatch
+def test_ranges_and_steps_are_asked_before_anything_is_judged_and_after_something_was_refused(
+    asks: str, kept: int, questions: list[str], first: Wider | Finer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     proposal, judged = (chosen_so(name, n) for name, n in (("proposed", 1), ("judged", kept)))
-    wider, asked_of, judgements = Wider({"k": (0.0, 2.0)}, 9.0), list[str](), list[object]()
+    asked_of, judgements = list[str](), list[object]()
 
-    def ends(_: Any, chosen: Any) -> Wider | None:
-        asked_of.append(chosen.optimum)
-        return wider if chosen.optimum == asks else None
+    def ends(_: Any, selection: Any) -> Wider | Finer | None:
+        asked_of.append(selection.chosen.optimum)
+        return first if selection.chosen.optimum == asks else None
 
     def judge(_: Any, __: Any, selection: Any, *___: Any) -> tuple[Any, list[Any], list[int]]:
         judgements.append(selection)
@@ -761,7 +763,8 @@ def test_ranges_are_asked_before_anything_is_judged_and_after_something_was_refu
     ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
     outcome = unwrap(_chosen_in)(found, none, ground, ends)
     chosen = proposal.chosen if asks == "proposed" else judged.chosen
-    assert outcome == (wider._replace(earlier=Earlier(none, chosen, heavy=True)) if asks else (found, judged, []))
+    earlier = Earlier(none, chosen, heavy=True, settled=isinstance(first, Finer))  # in finer steps the same is asked
+    assert outcome == (first._replace(earlier=earlier) if asks else (found, judged, []))
     assert asked_of == questions
     assert judgements == ([] if asks == "proposed" else [proposal])
 
