@@ -135,6 +135,9 @@ class Fits:
     def on(self, windows: Windows) -> "Fits":
         return Fits(self.noise, windows)
 
+    def of_noise(self) -> "Fits":
+        return self
+
     def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
         return [optimum(self.fitted(hypothesis)) for hypothesis in hypotheses]
 

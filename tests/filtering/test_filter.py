@@ -210,6 +210,19 @@ def test_a_batch_has_the_losses_and_slopes_of_its_windows_one_by_one(plan: Setup
     )
 
 
+def test_noise_alone_is_fitted_the_same_in_a_narrow_program(plan: Setup) -> None:
+    fitter = Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8)
+    n_p, n_r, n_q = plan.coordinates.sizes
+    levels, weight = tuple(range(n_p, n_p + n_r + n_q)), np.ones(len(plan.windows.episode))
+    starts = [Hypothesis(plan.start, levels, weight), Hypothesis(plan.start, levels[1:], np.eye(len(weight))[0])]
+    for wide, narrow in zip(fitter(starts), fitter.of_noise()(starts), strict=True):
+        np.testing.assert_allclose(narrow.z, wide.z, atol=1e-9)
+        np.testing.assert_allclose(narrow.log_evidence, wide.log_evidence, rtol=1e-9)
+        assert narrow.iterations == wide.iterations
+    with pytest.raises(ValueError, match="free unknowns"):
+        fitter.of_noise()([Hypothesis(plan.start, (0, 1, *levels), weight)])
+
+
 def test_a_planted_load_is_found_with_its_size_and_none_where_there_is_none() -> None:
     found = {}
     for load in (0.0, 0.5):

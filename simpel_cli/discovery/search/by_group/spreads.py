@@ -88,6 +88,10 @@ class Spreading:
         """Return the same with other bounds and priors."""
         return Spreading(self.fitter.within(coordinates), self.spreads)
 
+    def of_noise(self) -> Fitter:
+        """Return a fitter of the levels of noise alone, which has no spreads to choose."""
+        return self.fitter.of_noise()
+
     def _here(self, optimum: Optimum) -> list[int]:
         """Spreads of parameters that differ in this fit."""
         free = set(optimum.free)

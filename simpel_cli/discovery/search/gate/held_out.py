@@ -103,8 +103,9 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
         for i, out in enumerate(folds)
     ]
     if spare is not None:
+        of_noise = search.fitter.of_noise()
         for names, part, out in _batches(spare, len(groups)):
-            fits = search.fitter.on(part)([Hypothesis(t.optimum.z, search.noise, out.astype(float)) for t in trials])
+            fits = of_noise.on(part)([Hypothesis(t.optimum.z, search.noise, out.astype(float)) for t in trials])
             scored.append((part, out, len(groups) + names, fits, [np.zeros(len(out))] * len(trials)))
     if not scored:
         return [Gate(0.0, 0.0, 0.0, unit, harm=False, passed=False) for _ in parts]
