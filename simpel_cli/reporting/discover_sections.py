@@ -10,6 +10,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import ACCEPT, FURTHER
 from simpel_cli.discovery.verdict.remainder import dependence
+from simpel_cli.filtering.measurements.windows import LEAST_EPISODES
 from simpel_cli.reporting.equations import of_sensors
 from simpel_cli.reporting.figures import draw_discover
 from simpel_cli.reporting.figures.canvas import with_interval, with_unit
@@ -20,6 +21,7 @@ from simpel_cli.runs.files import read_columns
 AT_REST = -20.0  # nats: a fit so far below the simpler model has not converged, and its spread has no meaning
 NEAR_RANGE = 0.95  # share of a declared range that counts as all of it
 HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
+BLOCKS = "blocks of rows, as long as an error remembers; one that never forgets has none"
 Section = dict[str, Any]
 Table = Mapping[str, np.ndarray]
 
@@ -96,7 +98,7 @@ def error_section(found: Mapping[str, Any], errors: Table) -> Section:
             else ". "
         )
         + "Whole episode: the simulator gets the inputs only. "
-        + ("Intervals: 95 % bootstrap over episodes." if n > 1 else "One episode gives no interval.")
+        + f"Intervals: 95 % bootstrap over {'episodes' if n >= LEAST_EPISODES else BLOCKS}."
     )
     title = "Test error before and after" if both else "Test error of the calibrated simulator"
     return {"title": title, "head": head, "rows": rows, "note": note}

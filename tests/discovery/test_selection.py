@@ -27,7 +27,7 @@ from simpel_cli.discovery.search.sets import selection as selection_module
 from simpel_cli.discovery.search.sets.forward import MOST_MERGERS, further, select, selected
 from simpel_cli.discovery.search.sets.merging import _through, merged
 from simpel_cli.discovery.search.sets.rivals import CERTAINLY, rivalled
-from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut
+from simpel_cli.discovery.search.sets.selection import Selection, beaten, cut, steps
 from simpel_cli.discovery.search.trials import ACCEPT, QUIETER, SAME, TIE, Search, Stage, Trial, asked
 from simpel_cli.discovery.searched import _chosen_in
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -414,6 +414,19 @@ def test_harm_is_what_is_left_of_it_with_both_models_calibrated_for_the_use(
     assert bool(kept.chosen.terms) is stays
     assert [g.passed for g in judged] == [True] * stays
     assert len(harmful) == (not stays)
+
+
+def test_a_search_that_began_with_what_an_earlier_one_chose_tells_its_steps_from_the_start() -> None:
+    table = Table({"": 0.0, "A": 30.0, "B": 20.0, "AB": 60.0})
+    search: Any = table.search
+    whole = select(search)
+    assert steps(search, whole) == whole.stages  # which tells them itself
+    settled = selected(search, whole.base, 0, whole.path, settled=True)
+    assert settled.stages[0].before.terms == whole.chosen.terms
+    told = steps(search, settled)
+    assert [len(stage.before.terms) for stage in told] == [0, 1, 2]
+    assert [stage.trials[0].terms for stage in told[:2]] == [whole.chosen.terms[:1], whole.chosen.terms]
+    assert [len(stage.before.terms) for stage in steps(search, settled._replace(stages=()))] == [0, 1]
 
 
 def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

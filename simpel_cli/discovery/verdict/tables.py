@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.search.sets.selection import Selection
+from simpel_cli.discovery.search.sets.selection import Selection, steps
 from simpel_cli.discovery.search.trials import Search, asked
 from simpel_cli.discovery.verdict.verdict import before_of, interval_of
 from simpel_cli.filtering.errors_ahead import Assessment
@@ -205,10 +205,14 @@ def parameter_columns(search: Search, selection: Selection) -> Columns:
 
 
 def candidate_columns(search: Search, selection: Selection) -> Columns:
-    """Return every candidate of every step: its gain in log evidence, and whether that step added it."""
+    """Return every candidate of every step: its gain in log evidence, and whether that step added it.
+
+    Of steps that an earlier search took, in other ranges or noise, only what they added is known here.
+    """
     rows = []
-    for step, stage in enumerate(selection.stages, start=1):
-        following = selection.stages[step].before.terms if step < len(selection.stages) else selection.chosen.terms
+    stages = steps(search, selection)
+    for step, stage in enumerate(stages, start=1):
+        following = stages[step].before.terms if step < len(stages) else selection.chosen.terms
         for trial in stage.trials:
             term = search.terms[trial.terms[-1]]
             rows.append(

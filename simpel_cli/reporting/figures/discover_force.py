@@ -20,6 +20,7 @@ BINS = 14
 LEAST = 6  # rows of a bin
 MOST_POINTS = 600  # of a panel
 MOST_PANELS = 8
+TICKS = 4  # intervals of an axis of a small panel, whose numbers may be long
 TABLE = ("model", "split", "episode", "row", "time", "acts_on", "unit", "force", "std", "effect")
 STYLE = {"before": (COLOURS[1], "calibrated simulator"), "after": (COLOURS[0], "corrected simulator")}
 
@@ -157,4 +158,5 @@ def _band(axis: Any, b: Bins, colour: str, label: str) -> None:
 def _frame(axis: Any, argument: str, acts_on: str, units: dict[str, str], table: dict[str, np.ndarray]) -> None:
     unit = table["unit"][table["acts_on"] == acts_on][0]
     axis.axhline(0, color="0.5", linewidth=0.8)
+    axis.locator_params(axis="x", nbins=TICKS)
     axis.set(xlabel=with_unit(argument, units.get(argument, "")), ylabel=with_unit(f"force on {acts_on}", unit))

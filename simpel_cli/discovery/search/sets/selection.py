@@ -1,6 +1,7 @@
 """A set of effects that was chosen, and what is left of it without some of them."""
 
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,13 @@ def beaten(search: Search, found: Selection) -> bool:
 def path_of(search: Search, chosen: Trial) -> tuple[Trial, ...]:
     """Return the best fits from the simulator alone to a set of effects, one effect more at a time."""
     return tuple(search.part(chosen, chosen.terms[:k]) for k in range(len(chosen.terms) + 1))
+
+
+def steps(search: Search, found: Selection) -> tuple[Stage, ...]:
+    """Return the stages of a selection, and before them the steps to where a search began that another one was made before."""
+    begun = found.stages[0].before if found.stages else found.chosen
+    path = path_of(search, begun)
+    return (*(Stage(before, (after,)) for before, after in pairwise(path)), *found.stages)
 
 
 def cut(search: Search, found: Selection, kept: Sequence[int]) -> Selection:
