@@ -94,7 +94,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             ground = ground._replace(
                 model=model,
                 wider=ground.wider + 1,
-                earlier=found.earlier or ground.earlier,
+                earlier=found.earlier or (ground.earlier and ground.earlier._replace(settled=False)),
                 simulated=found.simulated or ground.simulated,
                 remembering=tuple(terms),
             )
@@ -261,9 +261,10 @@ def _with(
 
     def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
         chosen = selection.chosen
-        finer = too_coarse(search, assessor, chosen, selection.base) if options.substeps is None else None
-        if finer is not None and not ground.budget.over("finer integration steps"):
-            return finer
+        if options.substeps is None and not (chosen.terms and ground.budget.over("finer integration steps")):
+            finer = too_coarse(search, assessor, chosen, selection.base)
+            if finer is not None:
+                return finer
         return wider(search, chosen)
 
     def fitter(plan: Setup) -> Fitter:

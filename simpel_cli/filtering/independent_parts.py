@@ -1,11 +1,11 @@
 """Parts of a test whose errors are independent of each other, for intervals by resampling.
 
 Parts are episodes. Of one or two of them, which have no interval, they are blocks of rows, of every channel as long as its
-errors remember: a simulation that lost its way, as dead reckoning with a wrong heading does, is off by the same for the rest of
-the episode, and ten blocks of that are one error and not ten.
+errors remember, where there are five of these: a simulation that lost its way, as dead reckoning with a wrong heading does, is
+off by the same for the rest of the episode, and ten blocks of that are one error and not ten.
 
 Reference: Kuensch (1989), The jackknife and the bootstrap for general stationary observations (blocks); Geyer (1992), Practical
-Markov chain Monte Carlo, 3.3 (the integrated autocorrelation time).
+Markov chain Monte Carlo, 3.3 (the integrated autocorrelation time); Isserlis (1918) for the squares of Gaussian series.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from scipy.signal import correlate
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES
 
 BLOCKS = 10  # of a test window, where there are few episodes
+LEAST = 5  # blocks with an error: of fewer, resampling says too little
 NO_PART = -1
 CORRELATED = 0.1  # autocorrelation below which errors are taken for independent
 TIMES = 2.0  # correlation times that a block lasts at least
@@ -26,8 +27,8 @@ class Parts(NamedTuple):
 
     Args:
         before, after: (N, T, ny).
-        parts: number of the part that each piece is of, per channel, (N, ny); NO_PART of a channel that has no interval: of
-            fewer than three parts resampling says nothing.
+        parts: number of the part that each piece is of, per channel, (N, ny); NO_PART where there is no error, and of a
+            channel that has too few parts for an interval.
     """
 
     before: np.ndarray
@@ -47,17 +48,19 @@ def independent_parts(before: np.ndarray, after: np.ndarray, episode: np.ndarray
     if len(np.unique(episode)) >= LEAST_EPISODES:
         own = np.unique(episode, return_inverse=True)[1]
         return Parts(before, after, np.repeat(own[:, None], ny, axis=1))
+    there = np.asarray(np.isfinite([before, after]).any(axis=(0, 1, 3)))  # none has an error before its horizon
+    if there.any():
+        begin, end = int(np.argmax(there)), rows - int(np.argmax(there[::-1]))
+        before, after, rows = before[:, begin:end], after[:, begin:end], end - begin
     length = -(-rows // BLOCKS)
     first, second = cut = [_in_blocks(e, length) for e in (before, after)]
     parts = np.full((windows * BLOCKS, ny), NO_PART)
     for j in range(ny):
-        together = max(1, int(np.ceil(TIMES * _memory(before[..., j], after[..., j]) / length)))
-        own = np.arange(BLOCKS) // together
-        there = np.isfinite([e[..., j] for e in cut]).any(axis=(0, 2))
-        found = (np.arange(windows)[:, None] * BLOCKS + own).ravel()
-        # without a memory, blocks are parts however few of them have an error
-        if together == 1 or len(np.unique(found[there])) >= LEAST_EPISODES:
-            parts[:, j] = found
+        most = min(BLOCKS, int(rows / (TIMES * _memory(before[..., j], after[..., j]))))
+        own = (np.arange(windows)[:, None] * BLOCKS + np.arange(BLOCKS) * most // BLOCKS).ravel()
+        known = np.isfinite([e[..., j] for e in cut]).any(axis=(0, 2))
+        if len(np.unique(own[known])) >= LEAST:
+            parts[known, j] = own[known]
     return Parts(first, second, parts)
 
 
@@ -68,30 +71,30 @@ def per_channel(parts: np.ndarray, channels: int) -> np.ndarray:
 
 def correlation_time(errors: np.ndarray) -> float:
     """Return the integrated autocorrelation time of errors (W, T), rows, at least 1; NaN is no error."""
-    e = np.where(np.isfinite(errors), errors, 0.0)
-    rows = e.shape[1]
-    lags = sum((correlate(row, row, method="fft")[rows - 1 :] for row in e), np.zeros(rows))
-    if not lags[0] > 0:
-        return 1.0
-    r = lags / lags[0]
-    end = int(np.argmax(r < CORRELATED)) or rows
+    r = autocorrelation(errors)
+    end = int(np.argmax(r < CORRELATED)) or len(r)
     return max(1 + 2 * float(r[1:end].sum()), 1.0)
 
 
+def autocorrelation(errors: np.ndarray) -> np.ndarray:
+    """Return the autocorrelation of errors (W, T) about 0 at every lag, (T,); 1 at lag 0 alone where there is no error."""
+    e = np.where(np.isfinite(errors), errors, 0.0)
+    rows = e.shape[1]
+    lags = sum((correlate(row, row, method="fft")[rows - 1 :] for row in e), np.zeros(rows))
+    return lags / lags[0] if lags[0] > 0 else np.eye(1, rows)[0]
+
+
 def _memory(before: np.ndarray, after: np.ndarray) -> float:
-    """Return for how many rows the squared errors (W, T) of two models remember, beside their means.
+    """Return for how many rows the squared errors (W, T) of two models remember, that of the one that remembers longer.
 
-    log(RMSE before / RMSE after) is, to first order, the mean of e_b^2 / (2 mean e_b^2) - e_a^2 / (2 mean e_a^2); the two RMSE
-    have intervals of their own, so what remembers longest of these counts.
+    Squares of a Gaussian series of mean 0 are correlated by r^2, r the autocorrelation of the series itself. How the squares
+    of these few rows go would be no measure: those of a swing come and go, and all hang on how the swing began.
     """
-    squares = [e**2 / mean for e in (before, after) if (mean := _mean(e**2)) > 0]
-    of = [*squares, squares[0] - squares[1]] if len(squares) == 2 else squares
-    return max((correlation_time(d - _mean(d)) for d in of), default=1.0)
+    return max(_of_squares(e) for e in (before, after))
 
 
-def _mean(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else 0.0
+def _of_squares(errors: np.ndarray) -> float:
+    return 1 + 2 * float(np.sum(autocorrelation(errors)[1:] ** 2))
 
 
 def _in_blocks(errors: np.ndarray, length: int) -> np.ndarray:

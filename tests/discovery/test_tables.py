@@ -99,6 +99,7 @@ def test_one_episode_has_the_interval_of_its_blocks() -> None:
     alone = WINDOWS._replace(episode=np.zeros(len(WINDOWS.episode), int))
     rows = alone.ok.shape[1]
     half = np.where(np.arange(rows) % 4 == 0, 4.0, 2.0)[None, :, None]
-    table = error_columns(assessment(half), assessment(1.0), alone, {"x": "m"}, {"x": 0.1})
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(alone.episode), rows, 1))
+    table = error_columns(assessment(half * signs), assessment(signs), alone, {"x": "m"}, {"x": 0.1})
     assert 2 < table["reduction_low"][0] < table["reduction"][0] < table["reduction_high"][0] < 4
     assert table["after_low"][0] == table["after_high"][0] == 1.0

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_ranges import cart, measured, searched
+from test_ranges import DRAG, cart, measured, searched
 
 from simpel_cli.config.build import build
 from simpel_cli.discovery import last_calibration as last
@@ -141,3 +141,27 @@ def test_out_of_time_models_are_calibrated_for_their_use_without_asking_other_ep
     assert found.selection.chosen.optimum.z[0] != base.optimum.z[0]  # without a drag it simulates better elsewhere
     assert lines.getvalue() == "calibrated for free_run\n"
     np.testing.assert_allclose(found.for_use(base).optimum.z, found.selection.chosen.optimum.z)
+
+
+@pytest.mark.parametrize(("left", "stays"), [(None, True), (1e6, False), (1.0, True)])
+def test_a_range_that_is_wider_for_what_is_left_unexplained_alone_is_no_finding(
+    left: float | None, stays: bool
+) -> None:
+    """Data with a gain beyond the range: with much more left than that is worth, the range that was given stands."""
+    recording, terminal = measured(2.4), Terminal(quiet=True)
+    search = searched(recording, [DRAG], cart(0.8, 3.6))
+    base, budget = search.base(), Budget(None)
+    remainder = None if left is None else (search.terms[0], left)
+    selection = Selection(base, base, (base,), (), (), (), remainder)
+    ground = Ground(cart(), Cleaned(recording, (), {}), Discovery(), (), terminal, budget, Watch(budget))
+    found = last.last_calibration(ground, cart(), search, selection, Assessor(search.plan, 10), {})
+    row = [q.name for q in search.plan.augmented.params].index("b")
+    before, after = (
+        search.plan.coordinates.value(row, float(t.optimum.z[row]))
+        for t in (found.selection.base, found.selection.chosen)
+    )
+    assert before == pytest.approx(1.8, abs=0.02)
+    assert after == pytest.approx(2.4 if stays else 1.8, abs=0.02)
+    assert (found.wider > 100) == stays
+    assert bool(search.declared) == stays
+    assert found.selection.path == (found.selection.chosen,)

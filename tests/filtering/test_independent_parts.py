@@ -82,3 +82,16 @@ def test_correlation_time_of_an_autoregression() -> None:
     assert correlation_time(e) == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.15)
     assert correlation_time(random.normal(size=(40, 500))) == pytest.approx(1.0, abs=0.05)
     assert correlation_time(np.full((2, 5), np.nan)) == 1.0
+
+
+def test_a_swing_that_began_wrong_is_one_error() -> None:
+    """Two episodes of three swings each, whose sizes are chance: the squares come and go, and say nothing new each time."""
+    random = np.random.default_rng(3)
+    swings = np.sin(2 * np.pi * 3 * np.arange(60) / 60 + random.uniform(0, 6, (RUNS, 2, 2, 1)))
+    sizes = random.lognormal(sigma=0.5, size=(RUNS, 2, 2, 1))
+    wrong = []
+    for before, after in swings * sizes:
+        cut = independent_parts(before[..., None], after[..., None], np.arange(2))
+        low, high = reduction_interval(cut.before, cut.after, cut.parts, random)[:, 0]
+        wrong.append(low > 1 or high < 1)
+    assert np.mean(wrong) < 0.05

@@ -150,7 +150,7 @@ def gated_selection(
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
         earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
-        acts = {i for i in earned if not in_few_places(_by_row(search, assessor, chosen, parts[i]), STRONG)}
+        acts = {i for i in earned if len(parts) > 1 and not _of_outliers(search, assessor, chosen, parts[i])}
         if len(parts) > 1 and failed and all(i in acts and judged[i].gain > CARRIED * earned[i] for i in failed):
             (beside_none,) = gates(search, assessor, chosen, [selection.base])
             failed = [] if beside_none.passed else failed
@@ -176,11 +176,16 @@ def gated_selection(
     return selection, judged if selection.chosen.terms else [], harmful
 
 
-def _by_row(search: Search, assessor: Assessor, chosen: Trial, part: Trial) -> np.ndarray:
-    """Return what a model gains over another in every row that both were fitted to, nats, (W, T)."""
+def _of_outliers(search: Search, assessor: Assessor, chosen: Trial, part: Trial) -> bool:
+    """Whether a model gains over another in a few places alone of the rows that both were fitted to."""
+    return in_few_places(_by_row(search, assessor, chosen) - _by_row(search, assessor, part), STRONG)
+
+
+def _by_row(search: Search, assessor: Assessor, trial: Trial) -> np.ndarray:
+    """Return the log-likelihood of every row that a model was fitted to, (W, T)."""
     windows = search.plan.windows
-    with_it, without = (score(assessor(t.optimum.z, windows), windows) for t in (chosen, part))
-    return np.asarray(with_it - without)
+    asked = "by row", trial.terms, trial.optimum.z.tobytes()
+    return search.once(asked, lambda: score(assessor(trial.optimum.z, windows), windows))
 
 
 def with_interactions(

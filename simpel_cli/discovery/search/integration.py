@@ -12,6 +12,7 @@ Reference: Hairer, Norsett and Wanner (1993), Solving ordinary differential equa
 Kullback and Leibler (1951) for the shift of a Gaussian, in nats.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -24,23 +25,26 @@ from simpel_cli.filtering.likelihood.augmented import Augmented
 
 MOST = 8  # steps a row, at which one that switches is integrated as well as it will be
 VERY_MANY = 32
-ROWS = 2000  # looked at
+ROWS = 1000  # looked at
+LOST = 1e6  # variances that a row counts at most
 
 
 class Finer(NamedTuple):
     """A search worth making with more integration steps a row.
 
+    They are `MOST` at once: beside noise of the process that makes up for coarse steps, a little finer ones look fine.
+
     Args:
-        steps: a row.
         earlier: what was chosen with fewer.
+        steps: a row.
     """
 
-    steps: int
     earlier: Earlier | None = None
+    steps: int = MOST
 
 
 def too_coarse(search: Search, assessor: Assessor, trial: Trial, base: Trial) -> Finer | None:
-    """Return how many steps a row the effects of a model ask for, where that is more than are made; None: they do not.
+    """Return that the effects of a model ask for more steps a row than are made; None: they do not.
 
     What is missed has to be worth as much as an effect has to earn.
 
@@ -50,52 +54,62 @@ def too_coarse(search: Search, assessor: Assessor, trial: Trial, base: Trial) ->
         trial: the model.
         base: the simulator alone, which has the steps that it needs: what these miss is no matter of effects.
     """
-    plan = search.plan
-    steps = plan.substeps
-    if steps >= MOST or not trial.terms:
+    if search.plan.substeps >= MOST or not trial.terms:
         return None
-    least = ACCEPT + _missed(search, assessor, base, (steps,))[0]
-    tried = [n for n in (2 * steps, 4 * steps) if n < MOST]
-    first, *others = _missed(search, assessor, trial, (steps, *tried))
-    if not first > least:
-        return None
-    return Finer(next((n for n, cost in zip(tried, others, strict=True) if cost < least), MOST))
+    whole, alone = (
+        search.once(
+            ("missed", t.terms, t.optimum.z.tobytes()), partial(_missed, search, assessor, t, search.plan.substeps)
+        )
+        for t in (trial, base)
+    )
+    return Finer() if whole > ACCEPT + alone else None
 
 
-def _missed(search: Search, assessor: Assessor, trial: Trial, steps: tuple[int, ...]) -> list[float]:
+def _missed(search: Search, assessor: Assessor, trial: Trial, steps: int) -> float:
     """Return what so many steps a row miss of a model in all rows, nats."""
     plan, windows = search.plan, search.plan.windows
-    track, lead = assessor(trial.optimum.z, windows).track, windows.u.shape[1] - windows.y.shape[1]
+    track = assessor(trial.optimum.z, windows).track
     there = np.argwhere((windows.ok[:, 1:] > 0).any(axis=2))
     if not len(there):
-        return [0.0] * len(steps)
+        return 0.0
     kept = there[np.unique(np.linspace(0, len(there) - 1, min(ROWS, len(there))).astype(int))]
     w, k = kept.T
-    x, u = np.asarray(track.mean)[w, k], windows.u[w, lead + k, : len(plan.augmented.model.inputs)]
+    x, u = np.asarray(track.mean)[w, k], windows.u[w, windows.lead + k, : len(plan.augmented.model.inputs)]
     p = np.asarray(plan.coordinates.physical(jnp.asarray(trial.optimum.z))[0])
+    row = plan.augmented.model.dt * (windows.clock[w, k, 0] if plan.clocked else np.ones(len(w)))
     driven = list(plan.augmented.driven)
     sure = np.asarray(track.predicted_cov)[w, k + 1][:, driven, driven]
-    finest = _moved(plan.augmented, p, x, u, VERY_MANY)[:, driven]
-    found = []
-    for n in steps:
-        shift = _moved(plan.augmented, p, x, u, n)[:, driven] - finest
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cost = 0.5 * np.sum(np.log1p(shift**2 / sure), axis=1)
-        found.append(float(np.nan_to_num(cost, nan=0.0, posinf=0.0).mean()) * len(there))
-    return found
+    finest, coarse = (_moved(plan.augmented, p, x, u, row, n)[:, driven] for n in (VERY_MANY, steps))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        shift = np.where(coarse == finest, 0.0, (coarse - finest) ** 2 / sure)
+    shift = np.minimum(np.nan_to_num(shift, nan=LOST, posinf=LOST), LOST)  # steps that run away miss everything
+    counts = np.isfinite(finest).all(axis=1)
+    return float(0.5 * np.log1p(shift[counts]).sum() * len(there) / max(counts.sum(), 1))
 
 
-def _moved(augmented: Augmented, p: np.ndarray, x: np.ndarray, u: np.ndarray, steps: int) -> np.ndarray:
-    """Return states (N, nx) one row later, by the classical method of Runge and Kutta; p: (dp,), u: (N, nu), held."""
-    h, now = augmented.model.dt / steps, x.T
+def _moved(
+    augmented: Augmented, p: np.ndarray, x: np.ndarray, u: np.ndarray, row: np.ndarray, steps: int
+) -> np.ndarray:
+    """Return states (N, nx) one row later, by the classical method of Runge and Kutta.
+
+    Args:
+        augmented: the model.
+        p: (dp,) its parameters.
+        x: (N, nx) states.
+        u: (N, nu) inputs, which are held here: when one arrives within the row does not matter.
+        row: (N,) how long the row is, s.
+        steps: that it is cut into.
+    """
+    h, now = row / steps, x.T
     inputs, values = u.T, np.tile(p[:, None], len(x))
 
     def rate(at: np.ndarray) -> np.ndarray:
         return np.asarray(augmented.function(at, inputs, values)[0])
 
-    for _ in range(steps):
-        one = rate(now)
-        two = rate(now + h / 2 * one)
-        three = rate(now + h / 2 * two)
-        now = now + h / 6 * (one + 2 * two + 2 * three + rate(now + h * three))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for _ in range(steps):
+            one = rate(now)
+            two = rate(now + h / 2 * one)
+            three = rate(now + h / 2 * two)
+            now = now + h / 6 * (one + 2 * two + 2 * three + rate(now + h * three))
     return now.T

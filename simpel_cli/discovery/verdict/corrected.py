@@ -86,6 +86,8 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
     node = (_declared if plain else _extended)(sim, name, written, names, parameters)
+    if plain and search.plan.substeps > int(sim.get("substeps", Declared.substeps)):
+        node["substeps"] = search.plan.substeps  # which its parameters were fitted with
     sensors = shown(written, names, model, search.plan.augmented.measured)
     node |= {"sensors": sensors} if sensors else {}
     return name, node, [f"{t.label} ({cannot[t]})" for t in terms if cannot[t]]

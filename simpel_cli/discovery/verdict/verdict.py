@@ -102,6 +102,7 @@ def verdict_of(
             "after": noise_of(search, chosen)[1],
             "share_after": _shaken(search, chosen),
         },
+        "integration_steps": search.plan.substeps,
         "gate": [g._asdict() for g in gates],
         "groups": groups_of(
             search, chosen, {o.row: interval_of(search, chosen, o.row) for o in differing(search, chosen)}

@@ -137,10 +137,10 @@ def draw_errors(found: dict[str, Any], path: Path) -> Any:
             colour, label, _ = STYLE[model]
             at = place + (i - (len(models) - 1) / 2) * 0.22
             value, low, high = (own[c] for c in (model, f"{model}_low", f"{model}_high"))
-            bars = np.nan_to_num(np.stack([value - low, high - value])).clip(min=0)
-            axis.errorbar(
-                at, value, yerr=bars, fmt="o", color=colour, markersize=5, elinewidth=1.6, capsize=3, label=label
-            )
+            axis.plot(at, value, "o", color=colour, markersize=5, label=label)
+            told = np.isfinite(low) & np.isfinite(high)
+            bars = np.stack([value - low, high - value])[:, told].clip(min=0)
+            axis.errorbar(at[told], value[told], yerr=bars, fmt="none", ecolor=colour, elinewidth=1.6, capsize=3)
         axis.axhline(own["noise_floor"][0], color="0.4", linewidth=1, linestyle=":", label="measurement noise")
         values = np.concatenate([own[m][np.isfinite(own[m])] for m in models] + [own["noise_floor"]])
         if values.min() > 0 and values.max() > 3 * values.min():

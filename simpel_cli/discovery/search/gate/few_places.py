@@ -10,7 +10,7 @@ Reference: Huber and Ronchetti (2009), Robust statistics, 1.3 (trimmed sums).
 import numpy as np
 
 PLACES = 3
-REACH = 2  # rows before and behind that a place takes with it: a filter that was pulled away needs some to come back
+REACH = 1  # rows before and behind that a place takes with it: a filter that was pulled away comes back
 SPREAD = 0.5  # of the gain, that has to be left
 
 

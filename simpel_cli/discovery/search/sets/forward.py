@@ -66,7 +66,13 @@ def selected(
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
-    return _ended(search, _paired(search, grown))
+    found = _ended(search, _paired(search, grown))
+    if settled and len(found.chosen.terms) < len(
+        begun[-1].terms
+    ):  # what is not needed any more may have hidden another one
+        again = _grow(search, found.path)
+        found = _ended(search, _paired(search, again._replace(stages=(*found.stages, *again.stages))))
+    return found
 
 
 def further(search: Search, found: Selection) -> Selection:
