@@ -44,6 +44,8 @@ class Rig(NamedTuple):
         first: rows that tell the first state.
         substeps: of Runge and Kutta, a row.
         linear: whether inputs go straight from row to row; else they are held.
+        smooth: whether a linear input is a smooth curve through its rows, as a band-limited one is: a cubic in each row, with
+            slopes of fourth order at its ends (Hermite).
         per: whether every training episode has parameters of its own, which the test of the same name takes.
         part: rows of the pieces into which a training episode is cut, each with a first state of its own; None: whole.
     """
@@ -59,6 +61,7 @@ class Rig(NamedTuple):
     first: int
     substeps: int = 1
     linear: bool = False
+    smooth: bool = False
     per: bool = False
     part: int | None = None
     starts: tuple[dict[int, float], ...] = ({},)
@@ -68,11 +71,12 @@ def simulated(rig: Rig, p: Any, x: Any, u: Any, step: Any) -> Any:
     """Return what is read along a simulation, (T, ny); step: (T - 1,) seconds."""
     count = rig.substeps
 
-    def row(x: Any, now: tuple[Any, Any, Any]) -> tuple[Any, Any]:
-        begin, end, dt = now
+    def row(x: Any, now: tuple[Any, Any, Any, Any]) -> tuple[Any, Any]:
+        begin, end, bends, dt = now
         h = dt / count
         for k in range(count):
-            at = [begin + (end - begin) * ((k + part) / count) for part in (0.0, 0.5, 1.0)]
+            shares = [(k + part) / count for part in (0.0, 0.5, 1.0)]
+            at = [begin + (end - begin) * s + s * (1 - s) * ((1 - s) * bends[0] - s * bends[1]) for s in shares]
             a = rig.rates(x, at[0], p)
             b = rig.rates(x + h / 2 * a, at[1], p)
             c = rig.rates(x + h / 2 * b, at[1], p)
@@ -80,7 +84,12 @@ def simulated(rig: Rig, p: Any, x: Any, u: Any, step: Any) -> Any:
             x = x + h / 6 * (a + 2 * b + 2 * c + d)
         return x, x
 
-    rest = jax.lax.scan(row, x, (u[:-1], u[1:] if rig.linear else u[:-1], step))[1]
+    straight, bends = u[1:] - u[:-1], jnp.zeros((len(u) - 1, 2, u.shape[1]))
+    if rig.smooth:
+        near = jnp.pad(u, ((2, 2), (0, 0)), mode="edge")
+        slope = (8 * (near[3:-1] - near[1:-3]) - (near[4:] - near[:-4])) / 12  # a row
+        bends = jnp.stack([slope[:-1] - straight, slope[1:] - straight], axis=1)
+    rest = jax.lax.scan(row, x, (u[:-1], u[1:] if rig.linear else u[:-1], bends, step))[1]
     return rig.read(jnp.concatenate([x[None], rest]), p)
 
 
@@ -211,7 +220,7 @@ def cascaded_tanks(shared: Path) -> Rig:
 
 
 def silverbox(shared: Path) -> Rig:
-    """A stiffening spring, partly quadratic, and an offset; the input is linear between rows (Wigren and Schoukens 2013)."""
+    """A stiffening spring, partly quadratic, and an offset (Wigren and Schoukens 2013); the input is band-limited."""
 
     def rates(x: Any, u: Any, p: Any) -> Any:
         m, d, k, cubic, square, offset = p
@@ -227,7 +236,7 @@ def silverbox(shared: Path) -> Rig:
     parts["test_arrow, its first 32000 rows"] = Run(*(a[:32_000] for a in arrow))
     return Rig(
         rates, lambda x, p: x[:, :1], begin, lambda y: np.array([y[0, 0], (y[1, 0] - y[0, 0]) / 0.0016384]), train, parts,
-        ("y",), (1e3, "mV"), 50, substeps=2, linear=True,
+        ("y",), (1e3, "mV"), 50, substeps=4, linear=True, smooth=True,
     )  # fmt: skip
 
 

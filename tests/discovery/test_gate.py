@@ -47,6 +47,17 @@ def test_an_error_that_grows_in_one_channel_is_harm(factors: tuple[float, float]
     assert growing(*errors, ("a", "b"), np.arange(8)) == grows
 
 
+def test_an_error_that_is_more_likely_than_not_to_grow_leans() -> None:
+    """Of four parts one loses much and three gain a little: no growth is certain, but the sum of squares is larger."""
+    before = np.random.default_rng(0).normal(size=(4, 50, 1))
+    after = before * np.array([1.8, 0.95, 0.95, 0.95])[:, None, None]
+    assert growing({FREE: before}, {FREE: after}, ("a",), np.arange(4)) == ()
+    assert growing({FREE: before}, {FREE: after}, ("a",), np.arange(4), sure=0.5) == ("a in free run",)
+    judged = _judged(np.array([50.0, 5.0, 5.0, 5.0]), {FREE: before}, {FREE: after}, ["a"], np.arange(4), "episode")
+    assert judged.leans == ("a in free run",)
+    assert not judged.harm
+
+
 @pytest.mark.parametrize(("factor", "grows"), [(1.05, ()), (1.2, ("a one row ahead",))])
 def test_one_row_ahead_a_little_may_be_lost(factor: float, grows: tuple[str, ...]) -> None:
     before = np.random.default_rng(0).normal(size=(8, 50, 1))

@@ -462,16 +462,21 @@ def test_what_the_gate_leaves_must_earn_its_place_alone(monkeypatch: pytest.Monk
     assert judged == []
 
 
-@pytest.mark.parametrize(("few", "left"), [(True, "A"), (False, "AB")])
-def test_what_few_held_out_parts_cannot_tell_stays_unless_it_explains_a_few_places_alone(
-    few: bool, left: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("few", "leans", "left"), [(True, (), "A"), (False, (), "AB"), (False, ("v in free run",), "A")]
+)
+def test_what_few_held_out_parts_cannot_tell_stays_unless_it_explains_a_few_places_alone_or_an_error_may_grow(
+    few: bool, leans: tuple[str, ...], left: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     search: Any = Table({"": 0.0, "A": 60.0, "B": 40.0, "AB": 100.0}).search
     found = select(search)
 
     def judge(_: Any, __: Any, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
         names = [search.terms[t].effect for t in whole.terms] if len(parts) == len(whole.terms) else ["both"]
-        return [Gate(30.0, -1.0 if n == "B" else 5.0, 70.0, "episode", False, n != "B") for n in names]
+        return [
+            Gate(30.0, -1.0 if n == "B" else 5.0, 70.0, "episode", False, n != "B", leans=leans if n == "B" else ())
+            for n in names
+        ]
 
     def by_row(_: Any, __: Any, trial: Trial) -> np.ndarray:
         likelihood = np.zeros((3, 50))

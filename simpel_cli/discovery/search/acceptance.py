@@ -127,7 +127,7 @@ def gated_selection(
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
     member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps,
-    unless its evidence comes from a few places of the recording.
+    unless its evidence comes from a few places of the recording, or an error is more likely than not to grow.
     And where others fall with one that was not certain, they stay together if together they surely help beside what is left:
     an overflow may do harm without the outflow that belongs to it.
     Where a use is named, harm is what is left of it with both models calibrated for that.
@@ -149,7 +149,8 @@ def gated_selection(
                 harmless = grows is not None and not grows
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
-        earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
+        fine = [i for i in failed if not judged[i].harm and not judged[i].leans]
+        earned = {i: selection.gains[i] for i in fine if selection.gains[i] > STRONG}
         acts = {i for i in earned if len(parts) > 1 and not _of_outliers(search, assessor, chosen, parts[i])}
         if len(parts) > 1 and failed and all(i in acts and judged[i].gain > CARRIED * earned[i] for i in failed):
             (beside_none,) = gates(search, assessor, chosen, [selection.base])

@@ -43,6 +43,7 @@ class Gate(NamedTuple):
             seldom, as an overflow does, gains much in few parts.
         grows: which errors grow, in words.
         falls: which errors further ahead fall so.
+        leans: which errors are more likely than not to grow by more than is tolerated.
     """
 
     gain: float
@@ -53,6 +54,7 @@ class Gate(NamedTuple):
     passed: bool
     grows: tuple[str, ...] = ()
     falls: tuple[str, ...] = ()
+    leans: tuple[str, ...] = ()
 
 
 def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Trial]) -> list[Gate]:
@@ -245,7 +247,8 @@ def _judged(
     falls = growing({words: after[words] for words in further}, before, measured, of)
     total = float(gains.sum())
     helps = bool(low > 0) or (total > ACCEPT and bool(falls))
-    return Gate(total, low, high, unit, bool(grows), helps and not grows, grows, falls)
+    leans = growing(before, after, measured, of, sure=0.5)
+    return Gate(total, low, high, unit, bool(grows), helps and not grows, grows, falls, leans)
 
 
 def errors_of(found: Assessment) -> Errors:
@@ -254,8 +257,9 @@ def errors_of(found: Assessment) -> Errors:
 
 
 def growing(
-    before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray | Mapping[str, np.ndarray]
-) -> tuple[str, ...]:
+    before: Errors, after: Errors, measured: Sequence[str], groups: np.ndarray | Mapping[str, np.ndarray],
+    sure: float | None = None,
+) -> tuple[str, ...]:  # fmt: skip
     """Return which errors grow by more than is tolerated, certainly: of what, and how far ahead.
 
     Args:
@@ -263,6 +267,7 @@ def growing(
         after: with it.
         measured: names of the channels, ny.
         groups: of which part each window is, (W,) or per channel (W, ny); or these by horizon.
+        sure: chance that an error which does not grow is said to; None: `SURE` over all channels and horizons together.
     """
     of = groups if isinstance(groups, Mapping) else dict.fromkeys(before, groups)
     random = np.random.default_rng(1)
@@ -270,6 +275,7 @@ def growing(
     told = sum(int(np.isfinite(e).any(axis=(0, 1)).sum()) for e in before.values())
     most = {AHEAD[name]: 1 / (1 + tolerated) for name, tolerated in TOLERATED.items()}
     for words, error in before.items():
-        best = reduction_interval(error, after[words], of[words], random, level=1 - 2 * SURE / max(told, 1))[1]
+        level = 1 - 2 * (SURE / max(told, 1) if sure is None else sure)
+        best = reduction_interval(error, after[words], of[words], random, level=level)[1]
         found |= {f"{name} {words}": value < most[words] for name, value in zip(measured, best, strict=False)}
     return tuple(words for words, grows in found.items() if grows)
