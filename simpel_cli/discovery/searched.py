@@ -232,7 +232,7 @@ def _told(first: Wider | Finer, found: Calibrated, selection: Selection) -> Wide
 
 def chosen_of(found: Calibrated | Searched, selection: Selection) -> Earlier:
     """Return what a search has chosen, for one that is made after it."""
-    return Earlier(found.search, selection.chosen, heavy=bool(found.degrees_of_freedom))
+    return Earlier(found.search, selection.chosen, heavy=bool(found.degrees_of_freedom), stages=selection.stages)
 
 
 def _with(

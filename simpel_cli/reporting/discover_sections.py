@@ -21,7 +21,6 @@ from simpel_cli.runs.files import read_columns
 AT_REST = -20.0  # nats: a fit so far below the simpler model has not converged, and its spread has no meaning
 NEAR_RANGE = 0.95  # share of a declared range that counts as all of it
 HORIZONS = {"one_step": "one step", "horizon": "{steps} rows ahead", "free_run": "whole episode"}
-BLOCKS = "blocks of rows, as long as an error remembers; one that never forgets has none"
 Section = dict[str, Any]
 Table = Mapping[str, np.ndarray]
 
@@ -88,17 +87,14 @@ def error_section(found: Mapping[str, Any], errors: Table) -> Section:
     ]
     rows.append(["log likelihood per row", "nat", *likelihood, *([""] if both else []), ""])
     head = ["", "", *(["before", "after", "reduction"] if both else ["calibrated"]), "noise floor"]
-    n = error["episodes"]
-    fitted = "the simulator with its parameters fitted to the training episodes"
+    n, split = (
+        error["episodes"],
+        " (before), and of the same with what was found (after): the reduction is due to that alone",
+    )
     note = (
-        f"Root mean square errors on {n} test episode{'s' if n != 1 else ''}, in the units of the data, of {fitted}"
-        + (
-            " (before), and of the same with what was found (after): the reduction is due to that alone. "
-            if both
-            else ". "
-        )
-        + "Whole episode: the simulator gets the inputs only. "
-        + f"Intervals: 95 % bootstrap over {'episodes' if n >= LEAST_EPISODES else BLOCKS}."
+        f"Root mean square errors on {n} test episode{'s' if n != 1 else ''}, in the units of the data, of the simulator, "
+        f"fitted to the training episodes{split if both else ''}. Whole episode: the simulator gets the inputs only. "
+        f"Intervals: 95 % bootstrap over {'episodes' if n >= LEAST_EPISODES else 'blocks, where an error forgets'}."
     )
     title = "Test error before and after" if both else "Test error of the calibrated simulator"
     return {"title": title, "head": head, "rows": rows, "note": note}

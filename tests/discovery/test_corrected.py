@@ -62,7 +62,9 @@ def written(
     # the order in which terms were accepted is not that in which they were attached
     search = Search.__new__(Search)
     search.terms, search.rows = tuple(terms), [tuple(r) for r in rows]
-    search.plan = SimpleNamespace(augmented=SimpleNamespace(params=(), model=model, measured=measured or tuple(names)))
+    search.plan = SimpleNamespace(
+        substeps=1, augmented=SimpleNamespace(params=(), model=model, measured=measured or tuple(names))
+    )
     nothing = Optimum(np.zeros(1), (), 0.0, 0.0, np.zeros(0), np.eye(1), np.zeros(0), np.eye(1), 0, True)
     trial = Trial(tuple(reversed(range(len(terms)))), nothing)
     _, corrected, left_out = module.corrected(node, model, search, trial)

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from simpel_cli.discovery.search.again import Earlier, path_in
+from simpel_cli.discovery.search.again import Earlier, path_in, stages_in
 from simpel_cli.discovery.search.gate.few_places import in_few_places
 from simpel_cli.discovery.search.gate.harm import growing_for
 from simpel_cli.discovery.search.gate.held_out import Gate, gates, score
@@ -47,7 +47,8 @@ def proposed(
         earlier: a search that this one is made after, which has tried other beginnings.
     """
     if earlier is not None and (path := path_in(search, base, earlier)):
-        return selected(search, base, 0, path, settled=earlier.settled)
+        found = selected(search, base, 0, path, settled=earlier.settled)
+        return found._replace(stages=(*stages_in(search, earlier, path), *found.stages)) if earlier.settled else found
     selection = selected(search, base, options.beginnings, begun)
     return widely(search, selection) if far(search, assessor, selection.chosen) else selection
 
@@ -149,10 +150,10 @@ def gated_selection(
                 harmless = grows is not None and not grows
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
         failed = [i for i, found in enumerate(judged) if not found.passed]
-        fine = [i for i in failed if not judged[i].harm and not judged[i].leans]
-        earned = {i: selection.gains[i] for i in fine if selection.gains[i] > STRONG}
+        earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
         acts = {i for i in earned if len(parts) > 1 and not _of_outliers(search, assessor, chosen, parts[i])}
-        if len(parts) > 1 and failed and all(i in acts and judged[i].gain > CARRIED * earned[i] for i in failed):
+        helps = {i for i in acts if not judged[i].leans and judged[i].gain > CARRIED * earned[i]}
+        if len(parts) > 1 and failed and helps.issuperset(failed):
             (beside_none,) = gates(search, assessor, chosen, [selection.base])
             failed = [] if beside_none.passed else failed
         strong = all(i in acts and judged[i].gain > 0 for i in failed)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.smaller import carried, carried_windows, fitted_again, small_search
-from simpel_cli.discovery.search.trials import Search, Trial, asked
+from simpel_cli.discovery.search.trials import Search, Stage, Trial, asked
 from simpel_cli.discovery.search.unexplained.memories import Memory
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of, members
@@ -21,12 +21,31 @@ class Earlier(NamedTuple):
         chosen: its model.
         heavy: whether the noise had heavy tails there.
         settled: whether it was chosen in the same ranges and noise, so that only what stands beside it is asked.
+        stages: what was tried on the way there.
     """
 
     search: Search
     chosen: Trial
     heavy: bool = False
     settled: bool = False
+    stages: tuple[Stage, ...] = ()
+
+
+def stages_in(search: Search, earlier: Earlier, path: Sequence[Trial]) -> tuple[Stage, ...]:
+    """Return the stages of an earlier search until where this one begins, with their terms as they are called here."""
+    place = {key_of(term): t for t, term in enumerate(search.terms)}
+    here = {t: place.get(key_of(term)) for t, term in enumerate(earlier.search.terms)}
+
+    def called(trial: Trial) -> Trial | None:
+        terms = [here[t] for t in trial.terms]
+        return None if None in terms else Trial(tuple(t for t in terms if t is not None), trial.optimum)
+
+    found = []
+    for stage in earlier.stages:
+        before, trials = called(stage.before), [t for t in map(called, stage.trials) if t is not None]
+        if before is not None and len(before.terms) < len(path[-1].terms):
+            found.append(Stage(before, tuple(trials)))
+    return tuple(found)
 
 
 def path_in(search: Search, base: Trial, earlier: Earlier) -> tuple[Trial, ...]:
@@ -80,7 +99,7 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
     if gain <= asked(len(chosen.terms) + 1):
         return None
     small.together = set(search.together)
-    return earlier._replace(search=small, chosen=best, settled=True)
+    return earlier._replace(search=small, chosen=best, settled=True, stages=())
 
 
 class Again(NamedTuple):

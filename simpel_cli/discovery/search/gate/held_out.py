@@ -43,7 +43,7 @@ class Gate(NamedTuple):
             seldom, as an overflow does, gains much in few parts.
         grows: which errors grow, in words.
         falls: which errors further ahead fall so.
-        leans: which errors are more likely than not to grow by more than is tolerated.
+        leans: which errors further ahead than one row are more likely than not to grow by more than is tolerated.
     """
 
     gain: float
@@ -247,7 +247,8 @@ def _judged(
     falls = growing({words: after[words] for words in further}, before, measured, of)
     total = float(gains.sum())
     helps = bool(low > 0) or (total > ACCEPT and bool(falls))
-    leans = growing(before, after, measured, of, sure=0.5)
+    ahead = [words for words in before if words != AHEAD["one_step"]]
+    leans = growing({w: before[w] for w in ahead}, after, measured, of, sure=0.5)
     return Gate(total, low, high, unit, bool(grows), helps and not grows, grows, falls, leans)
 
 
