@@ -39,6 +39,7 @@ def written(
     effects: tuple[str | dict[str, Any], ...],
     monkeypatch: pytest.MonkeyPatch,
     measured: tuple[str, ...] = (),
+    substeps: int = 1,
 ) -> tuple[Model, list[Term], dict[str, Any], list[str]]:
     """Return the model, the terms, the corrected YAML with the terms at their starts, and what was left out."""
     node = node_of("sim", sim) if isinstance(sim, str) else sim
@@ -63,7 +64,7 @@ def written(
     search = Search.__new__(Search)
     search.terms, search.rows = tuple(terms), [tuple(r) for r in rows]
     search.plan = SimpleNamespace(
-        substeps=1, augmented=SimpleNamespace(params=(), model=model, measured=measured or tuple(names))
+        substeps=substeps, augmented=SimpleNamespace(params=(), model=model, measured=measured or tuple(names))
     )
     nothing = Optimum(np.zeros(1), (), 0.0, 0.0, np.zeros(0), np.eye(1), np.zeros(0), np.eye(1), 0, True)
     trial = Trial(tuple(reversed(range(len(terms)))), nothing)
@@ -98,6 +99,15 @@ OVEN = {
     "parameters": {"a": {"unit": "degC/s/%", "range": [0.01, 0.02]}},
     "dynamics": {"T": "a*(top + 2*bottom) - 0.01*(T - lid)", "lid": "a*top"},
 }
+
+
+@pytest.mark.parametrize(("fitted", "own", "takes"), [(8, 3, 8), (8, None, None), (2, 3, 3)])
+def test_the_yaml_takes_as_many_steps_as_its_parameters_were_fitted_with(
+    fitted: int, own: int | None, takes: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sim = OVEN if own is None else OVEN | {"substeps": own}
+    _, _, corrected, _ = written(sim, CASES["oven"], monkeypatch, substeps=fitted)
+    assert corrected.get("substeps") == takes  # None: what is usual, which is more
 
 
 @pytest.mark.parametrize("sim", [*CASES, "shaft", "in Python"])

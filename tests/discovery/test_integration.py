@@ -2,15 +2,18 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from command_line import process
 from test_ranges import cart
+from test_wide_ranges_of_a_run import SIM
 
 from simpel_cli.data.recording import Check, Episode, Recording
-from simpel_cli.discovery.search.integration import MOST, Finer, _missed, too_coarse
+from simpel_cli.discovery.search import integration
+from simpel_cli.discovery.search.integration import LOST, MOST, Finer, _missed, too_coarse
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
@@ -23,17 +26,6 @@ DRY = Expression(
                 "w": {"range": [0.01, 0.1], "neutral": 0.05, "unit": "m/s"}},
 )  # fmt: skip
 DRAG = Expression("drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 2], "unit": "1/s", "starts": [0.5]}})
-SIM = """name: cart
-dt: 0.1
-states:
-  s: {unit: m, range: [-30, 30]}
-  v: {unit: m/s, range: [-9, 9]}
-inputs:
-  u: {unit: V, range: [-3, 3], between_rows: held}
-parameters:
-  b: {unit: m/s^2/V, range: [0.8, 1.8]}
-dynamics: {s: v, v: b*u}
-"""
 DATA = "path: run.parquet\ntime: t\nepisode: episode\nsplit: {test_fraction: 0.25, by: episode}\n"
 FINE = 500  # steps of the truth, a row
 
@@ -91,21 +83,43 @@ def test_a_few_more_steps_are_not_enough(rubbing: Recording, steps: int) -> None
     assert asked(rubbing, DRY, MOST)[3].optimum.log_evidence > chosen.optimum.log_evidence - 1
 
 
-def test_more_steps_miss_less_and_steps_that_run_away_miss_everything(rubbing: Recording) -> None:
+def test_more_steps_miss_less_and_steps_that_run_away_miss_everything(
+    rubbing: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, search, assessor, chosen = asked(rubbing, DRY)
     missed = [_missed(search, assessor, chosen, n) for n in (1, 2, 4, 8)]
     assert missed == sorted(missed, reverse=True)
     assert missed[0] > 10 * missed[-1] >= 0
-    function = search.plan.augmented.function
+    moved = integration._moved
 
-    def stiff(x: np.ndarray, u: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
-        return [np.asarray(function(x, u, p)[0]) - 300 * x**3]  # 32 steps a row follow it, one does not
+    def lost(*given: Any) -> np.ndarray:
+        return moved(*given) * (np.nan if given[-1] == 1 else 1.0)
 
-    plan = search.plan._replace(augmented=search.plan.augmented._replace(function=stiff))
-    search.plan = plan
-    lost = _missed(search, assessor, chosen, 1)
-    assert np.isfinite(lost)
-    assert lost > missed[0]
+    monkeypatch.setattr(integration, "_moved", lost)
+    rows = (search.plan.windows.ok[:, 1:] > 0).any(axis=2).sum()
+    everything = rows * len(search.plan.augmented.driven) * 0.5 * np.log1p(LOST)
+    assert _missed(search, assessor, chosen, 1) == pytest.approx(everything)
+
+
+def test_a_row_is_as_long_as_its_clock_says(rubbing: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, search, assessor, chosen = asked(rubbing, DRY)
+    windows, dt, lengths = search.plan.windows, search.plan.augmented.model.dt, list[np.ndarray]()
+    pace = np.linspace(0.5, 2.0, windows.ok.shape[1])
+    clock = np.zeros((*windows.ok.shape[:2], 3))
+    clock[..., 0] = pace
+    moved = integration._moved
+
+    def recorded(*given: Any) -> np.ndarray:
+        lengths.append(given[4])
+        return moved(*given)
+
+    monkeypatch.setattr(integration, "_moved", recorded)
+    _missed(search, assessor, chosen, 1)
+    search.plan = search.plan._replace(clocked=True, windows=windows._replace(clock=clock))
+    _missed(search, assessor, chosen, 1)
+    even, _, uneven, _ = lengths
+    np.testing.assert_allclose(even, dt)
+    np.testing.assert_allclose(uneven, dt * np.tile(pace[:-1], len(windows.episode)))
 
 
 def test_no_more_steps_are_asked_for_where_sensors_would_not_show_it() -> None:

@@ -165,6 +165,20 @@ def test_figures(tmp_path: Path, kind: str) -> None:
     assert names == (wanted if kind in ("effect", "ambiguous") else [n for n in wanted if n != "effects"])
 
 
+def test_an_error_without_an_interval_is_drawn_without_one(tmp_path: Path) -> None:
+    searches.directory(tmp_path, "effect")
+    table = pd.read_parquet(tmp_path / "errors.parquet")
+    table.loc[table.horizon == "free_run", ["before_low", "before_high"]] = np.nan
+    table.to_parquet(tmp_path / "errors.parquet")
+    figure = discover_runs.draw_errors(searches.verdict("effect"), tmp_path / "errors.parquet")
+    per_output = len(table) // table.output.nunique()
+    for axis, output in zip(figure.axes, table.output.unique(), strict=False):
+        before, after = (container.lines[2][0].get_segments() for container in axis.containers)
+        assert (len(before), len(after)) == (per_output - 1, per_output), output
+        points = [line for line in axis.lines if line.get_label() == "calibrated simulator"]
+        assert [len(line.get_xdata()) for line in points] == [per_output]
+
+
 def test_the_curve_runs_through_the_points(tmp_path: Path) -> None:
     """The fitted curve of the figure lies inside the band of what is seen."""
     searches.directory(tmp_path, "effect")
