@@ -129,8 +129,8 @@ def gated_selection(
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
     member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps,
     unless its evidence comes from a few places of the recording, or an error is more likely than not to grow.
-    And where others fall with one that was not certain, they stay together if together they surely help beside what is left:
-    an overflow may do harm without the outflow that belongs to it.
+    And where others fall with one that was not certain, and gains in more places, they stay together if together they
+    surely help beside what is left: an overflow may do harm without the outflow that belongs to it.
     Where a use is named, harm is what is left of it with both models calibrated for that.
 
     Returns:
@@ -153,7 +153,7 @@ def gated_selection(
         earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
         acts = {i for i in earned if len(parts) > 1 and not _of_outliers(search, assessor, chosen, parts[i])}
         helps = {i for i in acts if not judged[i].leans and judged[i].gain > CARRIED * earned[i]}
-        if len(parts) > 1 and failed and helps.issuperset(failed):
+        if failed and helps.issuperset(failed):
             (beside_none,) = gates(search, assessor, chosen, [selection.base])
             failed = [] if beside_none.passed else failed
         strong = all(i in acts and judged[i].gain > 0 for i in failed)

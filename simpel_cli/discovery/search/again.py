@@ -20,7 +20,8 @@ class Earlier(NamedTuple):
         search: it.
         chosen: its model.
         heavy: whether the noise had heavy tails there.
-        settled: whether it was chosen in the same ranges and noise, so that only what stands beside it is asked.
+        settled: whether it was chosen in the same ranges and noise, or in coarser steps, so that only what stands beside it, or
+            beside what is left of it, is asked.
         stages: what was tried on the way there.
     """
 

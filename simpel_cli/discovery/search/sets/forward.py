@@ -67,9 +67,8 @@ def selected(
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
         grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
     found = _ended(search, _paired(search, grown))
-    if settled and len(found.chosen.terms) < len(
-        begun[-1].terms
-    ):  # what is not needed any more may have hidden another one
+    # what is not needed any more may have hidden another one
+    if settled and len(found.chosen.terms) < len(begun[-1].terms):
         again = _grow(search, found.path)
         found = _ended(search, _paired(search, again._replace(stages=(*found.stages, *again.stages))))
     return found
