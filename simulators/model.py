@@ -24,7 +24,9 @@ from simulators.definitions import (
 from simulators.expression import Symbol
 from simulators.quantity import (
     GIVEN,
+    HELD,
     LIMITS,
+    SMOOTH,
     ModelError,
     Quantity,
     check_free,
@@ -67,8 +69,8 @@ class Model:
         fixed: the known numbers by name, for the reader and for reports.
         delay: input: how much later it acts than it is recorded, s, or the parameter that says so.
         lag: input: time constant of a first-order lag behind the delay, s, or the parameter that says so.
-        between_rows: input: `held` over a transition at the value of its row, or `linear`, straight to the value of the next
-            row. Held where nothing is said.
+        between_rows: input: `held` over a transition at the value of its row, `linear`, straight to the value of the next
+            row, or `smooth`, a curve through the rows around. Held where nothing is said.
         covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
         per: uncertain parameter -> column of the groups from one to another of which it differs (`simulators.groups`).
         spreads: such a parameter -> range of its spread, where one was given.
@@ -132,9 +134,21 @@ class Model:
 
     @property
     def linear(self) -> tuple[int, ...]:
-        """Rows of the inputs that go straight from a row to the next: a transition depends on their next values, too."""
-        named = [self.between_rows.get(q.name) == "linear" for q in self.inputs]
-        return tuple(i for i, linear in enumerate(named) if linear and self.states)
+        """Rows of the inputs that move from a row to the next: a transition depends on their next values, too.
+
+        They go straight there, or nearly: what a smooth one does depends on the rows around, which a transition does not know.
+        """
+        return tuple(i for i, word in enumerate(self.words_between_rows) if word != HELD)
+
+    @property
+    def smooth(self) -> tuple[int, ...]:
+        """Those of them that are smooth curves through their rows."""
+        return tuple(i for i, word in enumerate(self.words_between_rows) if word == SMOOTH)
+
+    @property
+    def words_between_rows(self) -> tuple[str, ...]:
+        """What every input does from a row to the next; held where nothing is said, or nothing moves."""
+        return tuple(self.between_rows.get(q.name, HELD) if self.states else HELD for q in self.inputs)
 
     def past(self) -> int:
         """Return the number of inputs before its own that a transition of the system depends on."""
@@ -197,7 +211,7 @@ class Declared:
             leaves the `limits` is put back after each Runge-Kutta step (null: no limit), e.g. a level that cannot be negative.
             `role`: position, velocity, level, temperature or other; says which effects can act there.
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
-            slowly an input acts, `between_rows` (held or linear) what it does from one row to the next.
+            slowly an input acts, `between_rows` (held, linear or smooth) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
             {unit, range, prior: uniform|normal|lognormal, per: COLUMN, spread: [low, high]} (uncertain, see `Quantity`; with
             `per` it differs from group to group, by a `spread` that may have a range, see `simulators.groups`), or {unit,

@@ -12,7 +12,7 @@ from simulators.expression import CONSTANTS, RESERVED, ExpressionError, Symbol, 
 PRIORS = ("uniform", "normal", "lognormal")
 VARIABLE = ("unit", "range", "periodic")  # of a state or an input
 TIMES = ("delay", "lag")  # of an input
-BETWEEN_ROWS = ("held", "linear")  # what an input does from one row to the next
+BETWEEN_ROWS = HELD, LINEAR, SMOOTH = ("held", "linear", "smooth")  # what an input does from one row to the next
 GIVEN = (*TIMES, "between_rows")  # of an input
 LIMITS = ("limits", "role")  # of a state
 HIDDEN = "hidden"  # role of a state that nothing measures, on which nothing acts but what its equation says
@@ -201,7 +201,7 @@ def read_times(
 
 
 def read_between_rows(inputs: Mapping[str, Any]) -> dict[str, str]:
-    """Read what the inputs do between rows, of those that say so: `held`, or `linear`."""
+    """Read what the inputs do between rows, of those that say so: `held`, `linear` or `smooth`."""
     found = {}
     for name, node in inputs.items():
         if "between_rows" in node:

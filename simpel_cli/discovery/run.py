@@ -15,7 +15,7 @@ from simpel_cli.discovery.latencies import latencies_of, with_latencies
 from simpel_cli.discovery.latency import sentence_of as sentence_of_latency
 from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.next_experiment.determining import determining_experiments
-from simpel_cli.discovery.search.between_rows import LINEAR, Preference, sentence_of
+from simpel_cli.discovery.search.between_rows import MOVES, Preference, sentence_of
 from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
 from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
 from simpel_cli.discovery.search.by_group.strangers import assessed
@@ -111,7 +111,7 @@ def _run(declared: Declared, data_folder: Path, manifest: Manifest, publish: Pub
     if opens and not search.budget.over("experiments that determine what is left open"):
         terminal.line("which experiment determines what is left open", "search")
         found["determining_experiments"] = determining_experiments(search, selection.chosen, opens, directory)
-    declared = _with_linear_inputs(declared, searched.between_rows)
+    declared = _with_moving_inputs(declared, searched.between_rows)
     if found["effects"] or per or outside:
         found |= _correct(declared, searched, outside, found, directory, data_folder, terminal)
     write_text(directory / "verdict.json", json.dumps(strict_json(found), indent=1, allow_nan=False))
@@ -162,13 +162,13 @@ def _verdict(
     return found
 
 
-def _with_linear_inputs(declared: Declared, found: dict[str, Preference]) -> Declared:
-    """Return the configuration whose data say which inputs are linear, so that whatever follows takes them so."""
-    linear = {name: p.word for name, p in found.items() if p.word == LINEAR}
+def _with_moving_inputs(declared: Declared, found: dict[str, Preference]) -> Declared:
+    """Return the configuration whose data say which inputs move between rows, so that whatever follows takes them so."""
+    moving = {name: p.word for name, p in found.items() if p.word in MOVES}
     data = declared.config["data"]
     return (
-        declared.changed(data=data | {"between_rows": (data.get("between_rows") or {}) | linear})
-        if linear
+        declared.changed(data=data | {"between_rows": (data.get("between_rows") or {}) | moving})
+        if moving
         else declared
     )
 

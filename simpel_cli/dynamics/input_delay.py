@@ -1,8 +1,8 @@
-"""Inputs as they arrive: through a play, at a limited rate, held or linear between rows, delayed and lagged, over substeps.
+"""Inputs as they arrive: through a play, at a limited rate, as they are between rows, delayed and lagged, over substeps.
 
 A held input is a staircase; the mean over a substep that lies d in the past is a sum over samples, each weighted with the
-share of the substep that it fills: continuous in d, below one sample too. A linear input is a sum of hat functions; over a
-substep it is taken for the straight line that has its mean and its first moment.
+share of the substep that it fills: continuous in d, below one sample too. A linear or smooth input is such a sum of other
+kernels (`between_rows.py`); over a substep it is taken for the straight line that has its mean and its first moment.
 """
 
 from collections.abc import Sequence
@@ -10,6 +10,9 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from simpel_cli.dynamics.between_rows import KERNELS, beyond
+from simulators.quantity import HELD, LINEAR, SMOOTH
 
 STAGES = (-0.5, 0.0, 0.5)  # of a Runge-Kutta step: beginning, middle and end, from the middle of a substep
 
@@ -25,7 +28,8 @@ def delayed_inputs(
     half_play: Float[Array, " nu"] | None = None,
     slowness: Float[Array, " nu"] | None = None,
     linear: Sequence[int] = (),
-    share: Float[Array, " nu"] | None = None,
+    smooth: Sequence[int] = (),
+    way: Float[Array, " nu"] | None = None,
 ) -> Float[Array, "T substeps K nu"]:
     """Return the input of every substep of the rows behind the lead.
 
@@ -38,8 +42,9 @@ def delayed_inputs(
         lead: rows of the past; no delay is longer.
         half_play: half width of a play in front of the delay, in units of u, per input (see `play`); None: of no input.
         slowness: s per unit of u that its actuator moves, per input, behind the play (see `slewed`); None: of no input.
-        linear: inputs that go straight from a row to the next; the others are held.
-        share: of the way from held (0) to linear (1), per input, of those in `linear`; None: all of it.
+        linear: inputs that move from a row to the next, straight where nothing else is said; the others are held.
+        smooth: those of them that are smooth curves through their rows.
+        way: from held (0) over linear (1/2) to smooth (1), per input, of those in `linear`; None: as the words say.
 
     Returns:
         The values at beginning, middle and end of every substep (K = 3) where an input is linear; else, K = 1, the mean, which
@@ -47,29 +52,30 @@ def delayed_inputs(
     """
     if half_play is not None:
         u = play(u, half_play)
-    part = jnp.ones(u.shape[1], u.dtype) if share is None else share
     if slowness is not None:
-        lines = jnp.array([float(i in linear) for i in range(u.shape[1])], u.dtype)
-        u = slewed(u, slowness, dt, lines * part if linear else None)
-    rows = u.shape[0] - bool(linear)
+        straight = jnp.array([float(i in linear) for i in range(u.shape[1])], u.dtype)
+        straight = straight if way is None else straight * jnp.minimum(2 * way, 1.0)
+        u = slewed(u, slowness, dt, straight if linear else None)
+    rows, curved = u.shape[0] - bool(linear), bool(smooth) or way is not None
+    ahead, behind = int(bool(linear)) + curved, lead + curved  # rows near a row that have a share in it
     before = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])  # before the record the first input was held
-    near = before[jnp.arange(rows)[:, None] + jnp.arange(lead + 1 + bool(linear))[None]]
+    if curved:  # a row more at both ends; what it is matters to the first and the last row only
+        before = jnp.concatenate([beyond(before[::-1])[None], before, beyond(before)[None]])
+    near = before[jnp.arange(rows)[:, None] + jnp.arange(behind + 1 + ahead)[None]]
     order = jnp.arange(1, rows * substeps + 1, dtype=u.dtype)
     # how many rows the end of every substep lies behind each of the rows near it; whole numbers and fractions, no floor: two
     # compiled loops may round a quotient to two sides of a row, and read one sample with the weight of another
-    back = jnp.arange(lead, -1 - bool(linear), -1, dtype=u.dtype)[None]
+    back = jnp.arange(behind, -1 - ahead, -1, dtype=u.dtype)[None]
     back = back + (jnp.arange(substeps + 1, dtype=u.dtype) / substeps)[:, None]
 
     def weighed(weight: Array, near: Array) -> Array:
         return jnp.dot(near, weight.T, precision=jax.lax.Precision.HIGHEST).reshape(-1)
 
-    def held(near: Array, passed: Array) -> Array:
-        weight = jnp.diff(_ramp(passed), axis=0) * substeps
-        return weighed(_complete(weight, 1.0), near)  # later than all that is known: the oldest
-
-    def straight(near: Array, passed: Array) -> tuple[Array, Array]:
-        mean, rise = _hats(passed, substeps)
-        return weighed(_complete(mean, 1.0), near), weighed(_complete(rise, 0.0), near)
+    def line(word: str, near: Array, passed: Array) -> tuple[Array, Array]:
+        """Return mean and rise over every substep; what is held does not rise."""
+        mean, rise = KERNELS[word].shares(passed)
+        mean = weighed(_complete(mean, 1.0), near)  # later than all that is known: the oldest
+        return mean, jnp.zeros_like(mean) if word == HELD else weighed(_complete(rise, 0.0), near)
 
     def lagged(mean: Array, rise: Array, tau: Array) -> tuple[Array, Array]:
         """Return the exact answer of the lag to straight lines, as lines: mean and rise of every substep."""
@@ -89,23 +95,26 @@ def delayed_inputs(
         return mean - rise / ratio + fading * ((1 - keep) / ratio)[None], rise + fading * turn[None]
 
     def one_held(near: Array, d: Array, tau: Array) -> Array:
-        mean = held(near, back[:, : lead + 1] - d / dt)
-        return lagged(mean, jnp.zeros_like(mean), tau)[0]
+        return lagged(*line(HELD, near, back - d / dt), tau)[0]
 
-    def one_linear(near: Array, d: Array, tau: Array, part: Array) -> Array:
+    def one_moving(word: str, near: Array, d: Array, tau: Array, way: Array | None) -> Array:
         passed = back - d / dt
-        mean, rise = straight(near, passed)
-        stairs = held(near[:, : lead + 1], passed[:, : lead + 1])
-        mean, rise = lagged(stairs + part * (mean - stairs), part * rise, tau)
+        if way is None:
+            mean, rise = line(word, near, passed)
+        else:
+            parts = jnp.maximum(1 - 2 * way, 0.0), 1 - jnp.abs(2 * way - 1), jnp.maximum(2 * way - 1, 0.0)
+            each = [line(word, near, passed) for word in KERNELS]
+            mean, rise = (sum((part * one[k] for part, one in zip(parts, each, strict=True)), jnp.zeros(())) for k in (0, 1))
+        mean, rise = lagged(mean, rise, tau)
         return jnp.stack([mean + at * rise for at in STAGES])
 
     if not linear:
         every = jax.vmap(one_held, in_axes=(2, 0, 0), out_axes=1)(near, delay, lag)
         return every.reshape(rows, substeps, 1, -1)[lead:]
     columns = [
-        one_linear(near[..., i], delay[i], lag[i], part[i])
+        one_moving(SMOOTH if i in smooth else LINEAR, near[..., i], delay[i], lag[i], way if way is None else way[i])
         if i in linear
-        else jnp.broadcast_to(one_held(near[:, : lead + 1, i], delay[i], lag[i]), (len(STAGES), rows * substeps))
+        else jnp.broadcast_to(one_held(near[..., i], delay[i], lag[i]), (len(STAGES), rows * substeps))
         for i in range(u.shape[1])
     ]
     return jnp.moveaxis(jnp.stack(columns, axis=-1), 0, 1).reshape(rows, substeps, len(STAGES), -1)[lead:]
@@ -129,31 +138,6 @@ def prompt_inputs(u: Float[Array, "rows nu"], substeps: int, linear: Sequence[in
 def _complete(weight: Float[Array, "substeps near"], total: float) -> Float[Array, "substeps near"]:
     """Give the oldest row what the weights of a substep lack."""
     return weight.at[:, 0].add(total - jnp.sum(weight, axis=1))
-
-
-def _hats(passed: Float[Array, "ends near"], substeps: int) -> tuple[Array, Array]:
-    """Return mean and rise, over every substep, of the hat function about every row; the rise keeps the first moment.
-
-    Args:
-        passed: rows that lie between the row and the end of every substep, and the beginning of the first.
-        substeps: per row.
-    """
-    area, twice = _areas(passed)
-    h = 1 / substeps
-    moment = h / 2 * (area[1:] + area[:-1]) - jnp.diff(twice, axis=0)
-    return jnp.diff(area, axis=0) / h, 12 * moment / h**2
-
-
-def _areas(t: Array) -> tuple[Array, Array]:
-    """Return the integral of the hat function about 0, and that of the integral."""
-    up, down = _ramp(t + 1), _ramp(t)
-    area = up**2 / 2 + down - down**2 / 2
-    return area, up**3 / 6 + down / 2 + down**2 / 2 - down**3 / 6 + jnp.maximum(t - 1, 0.0)
-
-
-def _ramp(passed: Array) -> Array:
-    """Return how much of a sample has passed, from 0 to 1; at both ends the slope is that of a delay that begins to grow."""
-    return jnp.where(passed <= 0, 0.0, jnp.where(passed > 1, 1.0, passed))
 
 
 def play(u: Float[Array, "R nu"], half: Float[Array, " nu"]) -> Float[Array, "R nu"]:

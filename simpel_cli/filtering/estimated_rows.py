@@ -34,7 +34,6 @@ from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import LEAST_ROWS, Setup, setup, whole_windows
 from simpel_cli.filtering.tracks import Tracks
 from simulators.model import Model
-from simulators.quantity import BETWEEN_ROWS
 
 STARTS = 6  # of the calibration
 MOST_ROWS = 3000  # that the calibration looks at
@@ -88,9 +87,9 @@ def with_estimates(recording: Recording, model: Model, declared_noise: Sequence[
     Raises:
         DataError: too few rows, nothing but noise, or a simulator whose states run away.
     """
-    said = {q.name: BETWEEN_ROWS[i in model.linear] for i, q in enumerate(model.inputs)}
+    words = zip(model.inputs, model.words_between_rows, strict=True)
     model = replace(
-        model, between_rows=said
+        model, between_rows={q.name: word for q, word in words}
     )  # where nothing is said, an input is held: `discover` asks, a fit does not
     plan = setup(model, cleaned(recording, model, declared_noise).recording, declared_noise, [], most_rows=MOST_ROWS)
     tracks = Tracks(plan)

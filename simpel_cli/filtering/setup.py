@@ -195,12 +195,12 @@ def with_memory(model: Model, recording: Recording, effects: Sequence[Expression
 
 
 def questions(model: Model) -> list[Term]:
-    """Return one term per input of which nothing is said: the share of the way from held to linear between rows."""
-    share = EffectParameter("", "share", "1", 0.0, 1.0, 0.0, (1.0,))
+    """Return one term per input of which nothing is said: the way from held over linear to smooth between rows."""
+    way = EffectParameter("", "way", "1", 0.0, 1.0, 0.0, (1.0,))
     return [
         Term(
-            "linear_input", q.name, BETWEEN_ROWS, "", (share._replace(name=f"linear_input_{q.name}_share"),),
-            "an input that goes straight from a row to the next",
+            "moving_input", q.name, BETWEEN_ROWS, "", (way._replace(name=f"moving_input_{q.name}_way"),),
+            "an input that moves from a row to the next",
         )
         for q in model.inputs
         if q.name not in model.between_rows and q.name not in model.covariates and model.states

@@ -14,6 +14,7 @@ from simpel_cli.reporting.html import write_report
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.directory import typed
 from simpel_cli.runs.files import read_columns
+from simulators.quantity import HELD
 
 KINDS = {
     "effect": "An effect was found.",
@@ -119,8 +120,9 @@ def next_commands(found: dict[str, Any], directory: Path, config: dict[str, Any]
         lines.append(
             f"simpel fit --config-dir {typed(directory / 'conf')} sim={name} data={chosen.get('data', '')}{past}"
         )
-    linear = [name for name, said in (found.get("between_rows") or {}).items() if said["word"] == "linear"]
-    said = f" 'data.between_rows={{{','.join(f'{name}:linear' for name in linear)}}}'" if linear else ""
+    words = {name: said["word"] for name, said in (found.get("between_rows") or {}).items()}
+    moving = ",".join(f"{name}:{word}" for name, word in words.items() if word != HELD)
+    said = f" 'data.between_rows={{{moving}}}'" if moving else ""
     late = ",".join(f"{name}:{each['value']:.4g}" for name, each in (found.get("latency") or {}).items())
     again = f" 'data.latency={{{late}}}'" if late else ""
     # a fit takes whole rows only, which the estimate seldom is

@@ -8,7 +8,7 @@ RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
 RATE_LIMIT = "rate_limit"  # the signal moves by one unit in so many seconds at the fastest
-BETWEEN_ROWS = "between_rows"  # a share of the way from an input that is held to one that is linear
+BETWEEN_ROWS = "between_rows"  # the way from an input that is held over one that is linear to one that is smooth
 ON_INPUT = (DELAY, LAG, BACKLASH, RATE_LIMIT, BETWEEN_ROWS)
 ON_SENSOR = (SENSOR_DELAY, SENSOR_LAG)
 OPERATORS = (*ON_INPUT, *ON_SENSOR)

@@ -5,16 +5,21 @@ not share the approximations of what learns from them.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import casadi
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from simulators.model import TIE, Model, ModelError
+from simulators.quantity import HELD, LINEAR, SMOOTH
 from simulators.worlds.rk4 import RK4
 from simulators.worlds.world import FinerWorld, World
 
 SUBSTEPS = 10  # Runge-Kutta steps per row between rows, at least
+PIECES = 16  # straight ones in a row of a smooth input: off by 1/2048 of what it bends in a row
+PARABOLA = 3  # rows that one takes
 
 
 class Course(NamedTuple):
@@ -39,7 +44,7 @@ class Inputs(NamedTuple):
     Args:
         times: (n, rows) at which they are given, s, increasing.
         values: (n, rows, du).
-        linear: (du,) true: straight from a row to the next; false: held.
+        linear: (du,) true: straight from a time to the next; false: held.
 
     Before the first row the first value was held, after the last the last one is.
 
@@ -48,6 +53,29 @@ class Inputs(NamedTuple):
     times: np.ndarray
     values: np.ndarray
     linear: np.ndarray
+
+    @classmethod
+    def of_rows(cls, times: np.ndarray, values: np.ndarray, words: Sequence[str]) -> "Inputs":
+        """Return inputs that are given in rows, `held`, `linear` or `smooth` in between.
+
+        A smooth one is a cubic in each row, with the slopes of parabolas through three rows, drawn in short straight lines.
+        """
+        moving, rows = np.array([word != HELD for word in words], bool), values.shape[1]
+        if SMOOTH not in words or rows < PARABOLA:
+            return cls(times, values, moving)
+        shares = np.arange(PIECES) / PIECES
+        begin, lasts = times[:, :-1, None], np.diff(times)[:, :, None]
+        fine = np.concatenate([(begin + shares * lasts).reshape(len(times), -1), times[:, -1:]], axis=1)
+        found = np.zeros((*fine.shape, len(words)))
+        for k, i in np.ndindex(len(times), len(words)):
+            if words[i] == SMOOTH:
+                slopes = np.gradient(values[k, :, i], times[k], edge_order=2)
+                found[k, :, i] = CubicHermiteSpline(times[k], values[k, :, i], slopes)(fine[k])
+            elif words[i] == LINEAR:
+                found[k, :, i] = np.interp(fine[k], times[k], values[k, :, i])
+            else:
+                found[k, :, i] = np.repeat(values[k, :, i], PIECES)[: fine.shape[1]]
+        return cls(fine, found, moving)
 
     def course(self, t: np.ndarray, late: np.ndarray) -> Course:
         """Return how the inputs go that act at the times t (n, m), s, each `late` (n, du), s, after its row."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from simulators.model import TIE, Model, ModelError, Quantity
 from simulators.parameters import draw
-from simulators.quantity import BETWEEN_ROWS, check_word, refuse_unknown
+from simulators.quantity import BETWEEN_ROWS, HELD, check_word, refuse_unknown
 from simulators.worlds.excitation import Excitation, HeldRandom
 from simulators.worlds.groups import Covariate, Dealt, Group, Groups
 from simulators.worlds.motion import Drifting, Inputs, check_finite, named, true_values
@@ -80,8 +80,8 @@ class Simulate:
         rates: state or output -> s between two samples of its sensor; NaN in the rows between.
         clocks: state or output -> its sensor samples at times of its own: {offset, drift}. They become rows.
         jitter: share of dt by which the times of rows vary at random.
-        between_rows: input -> how the plant sees it between rows: held, or linear from row to row; where left out, as the
-            simulator says.
+        between_rows: input -> how the plant sees it between rows: held, linear from row to row, or smooth, a curve through the
+            rows; where left out, as the simulator says.
         groups: column -> groups to which episodes are dealt in turn, and parameters that differ between them.
         covariates: column -> a known number that differs between episodes, the value of a parameter.
         drift: parameter -> its relative change from the beginning to the end of an episode, linear in time.
@@ -200,8 +200,8 @@ class Simulate:
 
     def _check_kind(self, source: Model | World) -> None:
         """Refuse what makes no sense without time, or what a world cannot do."""
-        linear = [name for name, word in self.between_rows.items() if word == "linear"]
-        in_time = {"jitter": self.jitter, "drift": self.drift, "between_rows": linear}
+        moving = [name for name, word in self.between_rows.items() if word != HELD]
+        in_time = {"jitter": self.jitter, "drift": self.drift, "between_rows": moving}
         if not source.states or self.layout == "transitions":
             why, cure = "rows of layout transitions do not follow each other in time", "take layout=trajectories"
             if not source.states:
@@ -266,8 +266,8 @@ class Simulate:
             for k in range(n):
                 stream = self._streams.of(f"input.{quantity.name}", k)
                 values[k, :, i] = self.excitation.signal(stream, steps, source.dt, quantity)
-        linear = [self.between_rows.get(q.name) == "linear" for q in source.inputs]
-        return Inputs(times, values, np.array(linear, bool))
+        words = [self.between_rows.get(q.name, HELD) for q in source.inputs]
+        return Inputs.of_rows(times, values, words)
 
     def _drift_rates(self, source: Model | World, rows: int) -> np.ndarray:
         """Return the relative change of every parameter, 1/s, over so many rows."""
@@ -278,7 +278,7 @@ class Simulate:
         """Return the keys because of which the motion between rows matters."""
         given = {key: [*getattr(self, key).values()] for key in ("latency", "drift")}
         given |= {"clocks": [*self.clocks], "jitter": [self.jitter]}
-        given["between_rows"] = [word == "linear" for word in self.between_rows.values()]
+        given["between_rows"] = [word != HELD for word in self.between_rows.values()]
         return " and ".join(f"simulation.{key}" for key, values in given.items() if any(values))
 
     def _transitions(self, source: Model | World, dealt: Dealt) -> dict[str, np.ndarray]:

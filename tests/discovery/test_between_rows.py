@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.between_rows import asked_beside, in_words, preferences, settled, words_of
+from simpel_cli.discovery.search.between_rows import _better, asked_beside, in_words, preferences, settled, words_of
 from simpel_cli.discovery.search.calibration import prepared
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search
@@ -57,12 +57,31 @@ def asked(model: Model, data: Recording):
     return found, Search(plan._replace(start=settled(search, words_of(found))), fitter)
 
 
-@pytest.mark.parametrize("truth", [{"u": "linear", "v": "linear"}, {"u": "linear"}, {"v": "linear"}, {}])
+@pytest.mark.parametrize(
+    "truth",
+    [
+        {"u": "linear", "v": "linear"},
+        {"u": "linear"},
+        {"v": "linear"},
+        {},
+        {"u": "smooth"},
+        {"u": "linear", "v": "smooth"},
+    ],
+)
 def test_every_input_is_what_it_was_planted_as(truth: dict[str, str]) -> None:
     found, _ = asked(rotor(), recording(0, **truth))
     assert {name: p.word for name, p in found.items()} == {"u": "held", "v": "held"} | truth
     assert all(p.gain > 10 for p in found.values())
     assert "by" in in_words(found)
+
+
+@pytest.mark.parametrize(
+    ("line", "curve", "word"),
+    [(400.0, 403.0, "linear"), (400.0, 430.0, "smooth"), (1.0, 30.0, "smooth"), (1.0, 2.0, "held")],
+)
+def test_a_straight_line_is_taken_where_a_curve_is_hardly_better(line: float, curve: float, word: str) -> None:
+    evidence = {("held",): 0.0, ("linear",): line, ("smooth",): curve}
+    assert _better({0: "held"}, [{0: w} for (w,) in evidence], evidence) == {0: word}
 
 
 def test_parameters_follow_the_inputs() -> None:
@@ -106,9 +125,10 @@ def test_the_whole_program_takes_the_answer_as_said_and_begins_where_the_small_o
     np.testing.assert_allclose(plan.optimum[:2], everywhere.z[:2], atol=1e-3)
 
 
-def test_beside_an_effect_the_question_is_asked_anew() -> None:
+@pytest.mark.parametrize("truth", ["linear", "smooth"])
+def test_beside_an_effect_the_question_is_asked_anew(truth: str) -> None:
     """A drag that the simulator lacks hides what the input does; taken for held, the model chosen beside it is asked."""
-    data, model = recording(4, " - 0.6*w**3", u="linear", v="held"), rotor()
+    data, model = recording(4, " - 0.6*w**3", u=truth, v="held"), rotor()
     held = attached(rotor(u="held", v="held"), data)
     search = search_of(held)
     base = search.base()
@@ -116,7 +136,7 @@ def test_beside_an_effect_the_question_is_asked_anew() -> None:
     chosen = search.add(base, [drag]).trials[0]
     alone, _ = asked(model, data)
     beside = asked_beside(partial(attached, data=data), model, search, chosen, 2)
-    assert words_of(beside) == {"u": "linear", "v": "held"}
+    assert words_of(beside) == {"u": truth, "v": "held"}
     print({n: p.gain for n, p in alone.items()}, {n: p.gain for n, p in beside.items()})
     assert beside["u"].gain > 50
     assert beside["u"].gain > abs(alone["u"].gain)

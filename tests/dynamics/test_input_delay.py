@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 
+from simpel_cli.dynamics.between_rows import WAY
 from simpel_cli.dynamics.input_delay import delayed_inputs, play, slewed
 
 DT, SUBSTEPS, LEAD = 0.1, 4, 8
@@ -168,3 +170,43 @@ def test_a_limited_rate_comes_before_delay_and_lag(linear: tuple[int, ...]) -> N
         ).max()
         > 0.1
     )
+
+
+def curve(t: np.ndarray, rows: int) -> np.ndarray:
+    """What is smooth between rows, with the slopes of central differences; it stood still before the first row."""
+    given = np.concatenate([np.repeat(U[:1, 0], 3 * LEAD), U[:rows, 0]])
+    slopes = np.gradient(given, DT, edge_order=2)
+    return CubicHermiteSpline((np.arange(len(given)) - 3 * LEAD) * DT, given, slopes)(t)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.013, 0.137, 0.21])
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_smooth_input_has_the_mean_and_the_first_moment_of_its_curve(delay: float, asked: bool) -> None:
+    way = {"way": jnp.array([WAY["smooth"]])} if asked else {"smooth": (0,)}
+    late = jnp.array([delay]), jnp.array([0.0])
+    out = delayed_inputs(jnp.asarray(U), *late, dt=DT, substeps=SUBSTEPS, lead=LEAD, linear=(0,), **way)
+    h, fine = DT / SUBSTEPS, 2000
+    begin = LEAD * DT + np.arange((len(U) - 1 - LEAD) * SUBSTEPS) * h
+    offsets = (np.arange(fine) + 0.5) / fine * h
+    true = curve(begin[:, None] + offsets - delay, len(U))
+    rise = 12 * np.mean(true * (offsets - h / 2), axis=1) / h
+    lines = np.asarray(out)[..., 0].reshape(-1, 3)
+    np.testing.assert_allclose(lines[:, 1], true.mean(axis=1), atol=1e-5)
+    np.testing.assert_allclose(lines[:, 2] - lines[:, 0], rise, atol=1e-5)
+
+
+def test_without_a_past_the_first_row_bends_as_a_parabola_does() -> None:
+    u = (np.arange(6.0) ** 2)[:, None]
+    none = jnp.zeros(1), jnp.zeros(1)
+    out = delayed_inputs(jnp.asarray(u), *none, dt=DT, substeps=SUBSTEPS, lead=0, linear=(0,), smooth=(0,))
+    at = (np.arange(5 * SUBSTEPS) + 0.5) / SUBSTEPS
+    np.testing.assert_allclose(np.asarray(out)[:, :, 1, 0].ravel(), at**2 + 1 / (12 * SUBSTEPS**2), atol=1e-12)
+
+
+def test_every_word_is_a_place_on_the_way() -> None:
+    late = jnp.array([0.013]), jnp.array([0.04])
+    more = {"dt": DT, "substeps": SUBSTEPS, "lead": LEAD}
+    asked = {w: delayed_inputs(jnp.asarray(U), *late, **more, linear=(0,), way=jnp.array([WAY[w]])) for w in WAY}
+    np.testing.assert_allclose(asked["linear"], delayed_inputs(jnp.asarray(U), *late, **more, linear=(0,)), rtol=1e-9)
+    held = delayed_inputs(jnp.asarray(U[:-1]), *late, **more)
+    np.testing.assert_allclose(asked["held"][:, :, 1:2], held, rtol=1e-9)

@@ -138,5 +138,7 @@ def test_the_code_in_c_agrees(tmp_path, monkeypatch) -> None:
 
 
 def test_a_word_that_is_none_is_refused() -> None:
-    with pytest.raises(ModelError, match=r"sim.inputs.u.between_rows: 'lineare' is not allowed, only held or linear"):
+    with pytest.raises(
+        ModelError, match=r"sim.inputs.u.between_rows: 'lineare' is not allowed, only held or linear or smooth"
+    ):
         swing({"u": "lineare", "w": "held"})

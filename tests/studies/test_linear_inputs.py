@@ -46,7 +46,7 @@ def test_rows_that_do_not_follow_each_other_have_no_next_value(folder: Path) -> 
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"between_rows": {"u": "lineal"}}, "data.between_rows.u: 'lineal' is not allowed, only held or linear. Did you mean"),
+        ({"between_rows": {"u": "lineal"}}, "data.between_rows.u: 'lineal' is not allowed, only held or linear or smooth. Did"),
         ({"noise": {"law": "cauchy"}}, "data.noise.law: 'cauchy' is not allowed, only auto or gaussian or student_t"),
         ({"noise": {"laww": "auto"}}, "data.noise.laww: no such key, only law or scale. Did you mean law"),
         ({"split": {"column": "part", "test": "slow"}}, "data.split.test: 'slow' is not a list of values"),

@@ -1,9 +1,9 @@
-"""Whether an input is held from a row to the next or goes there in a straight line, where neither simulator nor data say.
+"""Whether an input is held from a row to the next, goes there straight or in a curve, where neither simulator nor data say.
 
-Both are the same program: an unknown share of the way, at 0 or at 1, which no fit moves. It is the first hypothesis of all:
-half a row's shift of an input looks like a delay, a lag or a spring. And it is asked again of the model that was chosen, since
-a missing effect may look like that shift. A share takes every stage of every step an input of its own: it is asked in a small
-program, and the whole one takes the answer as said.
+All are the same program: an unknown place on the way from held over linear to smooth, which no fit moves. It is the first
+hypothesis of all: half a row's shift of an input looks like a delay, a lag or a spring. And it is asked again of the model that
+was chosen, since a missing effect may look like that shift. It takes every stage of every step an input of its own: it is asked
+in a small program, and the whole one takes the answer as said.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,21 +14,24 @@ import numpy as np
 
 from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
+from simpel_cli.dynamics.between_rows import WAY
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of, questions
 from simulators.effects.term import BETWEEN_ROWS
 from simulators.model import Model
+from simulators.quantity import LINEAR, SMOOTH
 
-HELD, LINEAR = "held", "linear"
+MOVES = {LINEAR: "goes straight from a row to the next", SMOOTH: "is a smooth curve from row to row"}
+AGAINST = {LINEAR: "held or smooth", SMOOTH: "held or linear"}
 
 
 class Preference(NamedTuple):
     """What the data say of one input.
 
     Args:
-        word: held or linear.
-        gain: nats of evidence by which it is ahead of the other; negative where linear was ahead, but by too little to leave
-            the usual assumption for it.
+        word: held, linear or smooth.
+        gain: nats of evidence by which it is ahead of the next best; negative where another was ahead, but by too little to
+            leave the usual assumption for it.
     """
 
     word: str
@@ -48,7 +51,7 @@ def saying(model: Model, found: dict[str, Preference]) -> Model:
 def asked_beside(
     attach: Callable[..., Setup], model: Model, search: Search, chosen: Trial, side_by_side: int
 ) -> dict[str, Preference]:
-    """Compare held and linear inputs beside the effects that were chosen.
+    """Compare held, linear and smooth inputs beside the effects that were chosen.
 
     Args:
         attach: (model, kept, extra) -> the setup of a program with these terms alone.
@@ -65,51 +68,65 @@ def asked_beside(
 
 
 def preferences(search: Search, at: Trial) -> dict[str, Preference]:
-    """Compare held and linear inputs in one model, input by input, then all at once.
+    """Compare held, linear and smooth inputs in one model, input by input, then all at once.
 
     Args:
         search: with terms that ask.
-        at: the model, fitted with the shares in `search.plan.start`.
+        at: the model, fitted with the ways in `search.plan.start`.
     """
     names = asked_inputs(search)
     rows = {t: search.rows[t][0] for t in names}
-    said = {t: bool(search.plan.start[rows[t]] > 0.5) for t in names}
-    best, evidence, alone = dict(said), at.optimum.log_evidence, {}
-    sets = [[t] for t in names] + ([[*names]] if len(names) > 1 else [])
-    while sets:
-        fits = search.fitter([_flipped(search, at, [rows[t] for t in own], best, rows) for own in sets])
-        gains = [float(np.nan_to_num(f.log_evidence - evidence, nan=-np.inf)) for f in fits]
-        for own, gain in zip(sets, gains, strict=True):
-            if len(own) == 1:
-                alone[own[0]] = (not best[own[0]], gain)
-        first = int(np.argmax(gains))
-        # to leave what is usual, or what was chosen, takes the evidence of an effect
-        if gains[first] <= ACCEPT:
+    best = {t: min(WAY, key=lambda word: abs(WAY[word] - search.plan.start[rows[t]])) for t in names}
+    asked = [(t,) for t in names] + ([tuple(names)] if len(names) > 1 else [])
+    evidence = {tuple(best.values()): at.optimum.log_evidence}
+    while True:
+        others = [best | dict.fromkeys(own, word) for own in asked for word in WAY]
+        said = [words for words in others if tuple(words.values()) not in evidence]
+        fits = search.fitter([_said(search, at, words, rows) for words in said]) if said else []
+        for words, fit in zip(said, fits, strict=True):
+            evidence[tuple(words.values())] = float(np.nan_to_num(fit.log_evidence, nan=-np.inf))
+        after = _better(best, others, evidence)
+        if after == best:
             break
-        best |= {t: not best[t] for t in sets[first]}
-        evidence += gains[first]
-        sets = [own for own in sets if not set(own) & set(sets[first])]
-    found = {}
-    for t, name in names.items():
-        other, gain = alone[t]
-        found[name] = Preference(LINEAR if best[t] else HELD, gain if other == best[t] else -gain)
-    return found
+        best = after
+    alone = {t: {word: evidence[tuple((best | {t: word}).values())] for word in WAY} for t in names}
+    return {names[t]: Preference(best[t], _ahead(alone[t], best[t])) for t in names}
 
 
-def _flipped(
-    search: Search, at: Trial, flipped: Sequence[int], best: dict[int, bool], rows: dict[int, int]
-) -> Hypothesis:
+Words = dict[int, str]
+
+
+def _better(best: Words, others: Sequence[Words], evidence: Mapping[tuple[str, ...], float]) -> Words:
+    """Return the words to take in place of the best so far, or these.
+
+    To leave what is usual, or what was chosen, takes the evidence of an effect; so does a curve over a straight line.
+    """
+    worth = lambda words: evidence[tuple(words.values())]  # noqa: E731
+    first = max(others, key=worth, default=best)
+    if worth(first) <= worth(best) + ACCEPT:
+        return best
+    straight = {t: LINEAR if word == SMOOTH and best[t] != SMOOTH else word for t, word in first.items()}
+    simpler = tuple(straight.values()) in evidence and worth(best) + ACCEPT < worth(straight)
+    return straight if simpler and worth(first) <= worth(straight) + ACCEPT else first
+
+
+def _ahead(compared: Mapping[str, float], word: str) -> float:
+    """Return by how much a word is ahead of the next best."""
+    return compared[word] - max(gain for other, gain in compared.items() if other != word)
+
+
+def _said(search: Search, at: Trial, words: Mapping[int, str], rows: Mapping[int, int]) -> Hypothesis:
     z = search.loud(at.optimum.z)
-    for t, linear in best.items():
-        z[rows[t]] = float(linear != (rows[t] in flipped))
+    for t, word in words.items():
+        z[rows[t]] = WAY[word]
     return Hypothesis(z, search.free(at.terms), search.ones)
 
 
 def settled(search: Search, words: Mapping[str, str]) -> np.ndarray:
-    """Return `plan.start` with the shares that follow from words: held or linear, by input."""
+    """Return `plan.start` with the ways that follow from words: held, linear or smooth, by input."""
     start = search.plan.start.copy()
     for t, name in asked_inputs(search).items():
-        start[search.rows[t][0]] = float(words[name] == LINEAR)
+        start[search.rows[t][0]] = WAY[words[name]]
     return start
 
 
@@ -128,7 +145,7 @@ def words_of(found: dict[str, Preference]) -> dict[str, str]:
 
 
 def sentence_of(found: dict[str, Preference]) -> str:
-    """Return what a verdict says of linear inputs; nothing where all are held, as is usual."""
-    linear = [f"{name} goes straight from a row to the next (by {p.gain:.0f} nats, against held between rows)"
-              for name, p in found.items() if p.word == LINEAR]  # fmt: skip
-    return f" The input {' and '.join(linear)}." if linear else ""
+    """Return what a verdict says of inputs that move between rows; nothing where all are held, as is usual."""
+    moving = [f"{name} {MOVES[p.word]} (by {p.gain:.0f} nats, against {AGAINST[p.word]} between rows)"
+              for name, p in found.items() if p.word in MOVES]  # fmt: skip
+    return f" The input {' and '.join(moving)}." if moving else ""

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from simpel_cli.dynamics.between_rows import WAY, beyond
 from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.dynamics.integrate import at_stages
 from simpel_cli.filtering.likelihood.augmented import Augmented
@@ -58,7 +59,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
     key = (
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
         augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag,
-        augmented.own_late, model.linear, augmented.remainders, substeps, lead,
+        augmented.own_late, model.linear, model.smooth, augmented.remainders, substeps, lead,
     )  # fmt: skip
     if key not in _KEPT:
         name = hashlib.sha256(repr(key).encode()).hexdigest()
@@ -79,9 +80,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     wraps = [name in periodic for name in augmented.measured]
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
     slow = augmented.operators[RATE_LIMIT]
-    # where it is asked whether an input is linear, a share of the way from held says so
+    # where it is asked what an input does between rows, the way from held over linear to smooth says so
     linear = tuple(sorted({*model.linear, *(signal for signal, _ in shares)}))
-    said = tuple(float(i in model.linear) for i in range(nu))
+    said = tuple(WAY[word] for word in model.words_between_rows)
     sensor_delays, sensor_lags = (augmented.operators[kind] for kind in (SENSOR_DELAY, SENSOR_LAG))
 
     def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
@@ -103,12 +104,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         more = {"half_play": per_signal(p, plays, nu)} if plays else {}
         if slow:
             more["slowness"] = per_signal(p, slow, nu)
-        if linear:
-            more["share"] = per_signal(p, shares, nu, said)
-            u = jnp.concatenate([u, u[-1:]])  # nothing is predicted from the last row of a window
+        if shares:
+            more["way"] = per_signal(p, shares, nu, said)
+        if linear:  # nothing is predicted from the last row of a window, but a smooth input reads beyond it before
+            u = jnp.concatenate([u, beyond(u)[None] if shares or model.smooth else u[-1:]])
 
         def one(u: Array, delay: Array, lag: Array, more: dict[str, Array]) -> Array:
-            return delayed_inputs(u, delay, lag, dt=dt, substeps=substeps, lead=lead, linear=linear, **more)
+            return delayed_inputs(
+                u, delay, lag, dt=dt, substeps=substeps, lead=lead, linear=linear, smooth=model.smooth, **more
+            )
 
         return _over_points(one, p.ndim - 1)(u, *times, more)
 
@@ -174,7 +178,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
     def moving(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
-        """Return the motion at a point of a row; u: of its substeps. Linear inputs rise or fall evenly in it, others jump."""
+        """Return the motion at a point of a row; u: of its substeps. What is held jumps, others rise or fall in it."""
         bend = applied(rate_x, rate)
         if linear and late_ones:
             first, last = (plain_rates(x, end, p) for end in (u[0, 0], u[-1, -1]))

@@ -1,0 +1,76 @@
+"""What an input does between rows, as the share of every row in it: a sum of one kernel about each row.
+
+A held input is a sum of boxes that begin at their rows, a linear one of hats, and a smooth one of the kernel of cubic
+convolution, which puts a cubic into each row, with the slopes of central differences. What an input is over a substep, its mean
+and its first moment, are differences of the kernel's integrals, exact and continuous in a delay.
+
+Reference: Keys (1981), Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (kernel with a = -1/2,
+and the parabola beyond both ends).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from simulators.quantity import HELD, LINEAR, SMOOTH
+
+WAY = {HELD: 0.0, LINEAR: 0.5, SMOOTH: 1.0}  # from held over linear to smooth, where it is asked
+
+
+class Kernel(NamedTuple):
+    """A function of the time since a row, in rows: polynomials in pieces of one row.
+
+    Args:
+        first: where the first piece begins.
+        pieces: coefficients of every piece, from the constant one on, in the time since the piece began.
+    """
+
+    first: int
+    pieces: tuple[tuple[float, ...], ...]
+
+    def integrals(self, t: Array) -> tuple[Array, Array]:
+        """Return the integral of the kernel up to t, and that of the integral."""
+        area, twice, whole = jnp.zeros_like(t), jnp.zeros_like(t), 0.0
+        for k, piece in enumerate(self.pieces):
+            s = ramp(t - (self.first + k))
+            once = [c / (i + 1) for i, c in enumerate(piece)]
+            area = area + _polynomial((0.0, *once), s)
+            twice = twice + whole * s + _polynomial((0.0, 0.0, *(c / (i + 2) for i, c in enumerate(once))), s)
+            whole += sum(once)
+        return area, twice + whole * jnp.maximum(t - (self.first + len(self.pieces)), 0.0)
+
+    def shares(self, passed: Float[Array, "ends near"]) -> tuple[Array, Array]:
+        """Return mean and rise, over every substep, of the kernel about every row; the rise keeps the first moment.
+
+        Args:
+            passed: rows that lie between the row and the end of every substep, and the beginning of the first.
+        """
+        h = 1 / (passed.shape[0] - 1)
+        area, twice = self.integrals(passed)
+        moment = h / 2 * (area[1:] + area[:-1]) - jnp.diff(twice, axis=0)
+        return jnp.diff(area, axis=0) / h, 12 * moment / h**2
+
+
+KERNELS = {
+    HELD: Kernel(0, ((1.0,),)),
+    LINEAR: Kernel(-1, ((0.0, 1.0), (1.0, -1.0))),
+    SMOOTH: Kernel(-2, ((0.0, 0.0, -0.5, 0.5), (0.0, 0.5, 2.0, -1.5), (1.0, 0.0, -2.5, 1.5), (0.0, -0.5, 1.0, -0.5))),
+}
+
+
+def beyond(u: Float[Array, "rows *nu"]) -> Float[Array, " *nu"]:
+    """Return the value behind the last, as a parabola through the last three has it; of fewer the last."""
+    return 3 * u[-1] - 3 * u[-2] + u[-3] if len(u) > 2 else u[-1]
+
+
+def ramp(passed: Array) -> Array:
+    """Return how much of a sample has passed, from 0 to 1; at both ends the slope is that of a delay that begins to grow."""
+    return jnp.where(passed <= 0, 0.0, jnp.where(passed > 1, 1.0, passed))
+
+
+def _polynomial(coefficients: tuple[float, ...], s: Array) -> Array:
+    found = jnp.zeros_like(s)
+    for c in reversed(coefficients):
+        found = found * s + c
+    return found
