@@ -104,7 +104,9 @@ def delayed_inputs(
         else:
             parts = jnp.maximum(1 - 2 * way, 0.0), 1 - jnp.abs(2 * way - 1), jnp.maximum(2 * way - 1, 0.0)
             each = [line(word, near, passed) for word in KERNELS]
-            mean, rise = (sum((part * one[k] for part, one in zip(parts, each, strict=True)), jnp.zeros(())) for k in (0, 1))
+            mean, rise = (
+                sum((part * one[k] for part, one in zip(parts, each, strict=True)), jnp.zeros(())) for k in (0, 1)
+            )
         mean, rise = lagged(mean, rise, tau)
         return jnp.stack([mean + at * rise for at in STAGES])
 

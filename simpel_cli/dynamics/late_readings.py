@@ -1,18 +1,19 @@
 """States and outputs as late sensors show them, and states from what such sensors showed, for one point.
 
-A delay d and a lag tau act together as exp(-d s)/(1 + tau s). Along a smooth motion that is, to second order,
+A delay d and a lag tau act together as exp(-d s)/(1 + tau s). Along a smooth motion that is, to third order,
 
-    y = c - (d + tau) c' + (d^2/2 + d tau + tau^2) c'',    c: what a prompt sensor shows
+    y = c - m_1(d) c' + m_2(d) c'' - m_3(d) c''',    m_n(d) = sum over i <= n of d^i tau^(n-i)/i!,    c: what a prompt one shows
 
-which holds while d and tau are short against the motion (the next term is about tau^3 times the third derivative). Inputs
-are held from a row to the next, so c' jumps at the rows. A jump J at age a adds what the motion since then does not show,
+which holds while d and tau are short against the motion (the next term is about tau^4 times the fourth derivative). Inputs
+are held from a row to the next, so c' jumps at the rows, and with it c'' and c'''. A jump J_n of the n-th derivative at age a
+adds what the motion since then does not show: of the time before the jump that is seen, d - a and what the lag adds,
 
-    J tau exp((d - a)/tau)  where d <= a,    J (d + tau - a)  where the delay reaches behind it,
+    -(-1)^n J_n m_n(d - a)  where the delay reaches behind it,    -(-1)^n J_n tau^n exp((d - a)/tau)  where d <= a.
 
-and one of c'' likewise, -J tau^2 exp((d - a)/tau) or -J ((d - a)^2/2 + (d - a) tau + tau^2). What y says of the state is
-solved for by Newton's method with one slope: exact in one step for a linear system.
+What y says of the state is solved for by Newton's method with one slope: exact in one step for a linear system.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from simpel_cli.dynamics.casadi_jax import to_jax
 from simulators.model import Model
 
 JUMPS = 4  # rows that are looked back on
+ORDERS = 3  # of the series
 STEPS = 3  # of Newton's method
 
 Point = Float[Array, " dx"]
@@ -71,42 +73,42 @@ class Late(NamedTuple):
                 return jnp.concatenate([way, jnp.zeros(len(d) - len(way), way.dtype)])
             return jnp.concatenate([way, jax.jvp(lambda x: self.whole(x, now, phi)[1], (x,), (way,))[1]])
 
-        def motion(u: Float[Array, "K du"], at: int) -> tuple[Array, Array]:
-            """Return c' and c'' at the beginning (0) or the end (-1) of a substep."""
-            rise = (u[-1] - u[0]) * self.substeps / self.dt
-            first, second = jax.jvp(
-                lambda x, u: self.whole(x, u, phi)[0], (x, u[at]), (self.whole(x, u[at], phi)[0], rise)
-            )
-            return along(first), along(second)
+        def rate(x: Point, u: Float[Array, " du"]) -> Point:
+            return self.whole(x, u, phi)[0]
 
-        first, second = motion(rows[-1, -1], -1)
-        shown = -(d + tau) * first + (0.5 * d**2 + d * tau + tau**2) * second
+        def motion(u: Float[Array, "K du"], at: int) -> Float[Array, "orders n"]:
+            """Return the first derivatives of c at the beginning (0) or the end (-1) of a substep."""
+            rise, each = (u[-1] - u[0]) * self.substeps / self.dt, [rate]
+            for _ in range(1, ORDERS):
+                each.append(_in_time(each[-1], rate, rise))
+            return jnp.stack([along(of(x, u[at])) for of in each])
+
+        shown = jnp.sum(signed_moments(d, tau) * motion(rows[-1, -1], -1), axis=0)
         past = min(JUMPS, len(rows) - 1) if self.driven else 0
         if not past:
             return shown
-        both = [(motion(rows[-k, 0], 0), motion(rows[-k - 1, -1], -1)) for k in range(1, past + 1)]
-        once, twice = (jnp.stack([to[i] - was[i] for to, was in both]) for i in (0, 1))
-        return shown + echo(d, tau, once, self.dt) - echo_of_curvature(d, tau, twice, self.dt)
+        jumps = [motion(rows[-k, 0], 0) - motion(rows[-k - 1, -1], -1) for k in range(1, past + 1)]
+        return shown + echo(d, tau, jnp.stack(jumps), self.dt)
 
     def meant(self, read: Point, rows: Rows, phi: Float[Array, " dp"]) -> Point:
         """Return the states, as prompt sensors show them, of what late ones showed at the end of rows."""
         if not self.states:
             return read
         late = list(self.states)
-        d, tau = (t[jnp.array(late)] for t in self.times(phi))
-        second = 0.5 * d**2 + d * tau + tau**2
+        moments = signed_moments(*(t[jnp.array(late)] for t in self.times(phi)))
 
         def rate(x: Point) -> Point:
             return self.whole(x, rows[-1, -1, -1], phi)[0]
 
-        x = read.at[jnp.array(late)].add((d + tau) * rate(read)[jnp.array(late)])
+        x = read.at[jnp.array(late)].add(-moments[0] * rate(read)[jnp.array(late)])
         columns = []
         for k, row in enumerate(late):
             unit = jnp.zeros_like(x).at[row].set(1.0)
-            once = jax.jvp(rate, (x,), (unit,))[1]
-            twice = jax.jvp(rate, (x,), (once,))[1]
-            own = jnp.zeros_like(d).at[k].set(1.0)
-            columns.append(own - (d + tau) * once[jnp.array(late)] + second * twice[jnp.array(late)])
+            column, way = jnp.zeros_like(moments[0]).at[k].set(1.0), unit
+            for moment in moments:
+                way = jax.jvp(rate, (x,), (way,))[1]
+                column = column + moment * way[jnp.array(late)]
+            columns.append(column)
         slope = jnp.stack(columns, axis=1)
         for _ in range(STEPS):
             off = (x + self.behind(x, rows, phi)[: len(x)] - read)[jnp.array(late)]
@@ -150,21 +152,26 @@ def behind(model: Model, states: np.ndarray, inputs: np.ndarray, phi: np.ndarray
     return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(states), jnp.asarray(before), jnp.asarray(inputs)))
 
 
+def signed_moments(d: Float[Array, "n ..."], tau: Float[Array, "n ..."]) -> Float[Array, "orders n ..."]:
+    """Return what the derivatives of a smooth motion count in a late reading: -m_1, m_2, -m_3."""
+    found = [-(d + tau)]
+    for n in range(2, ORDERS + 1):  # m_n = tau m_(n-1) + d^n/n!
+        found.append(-tau * found[-1] + (-d) ** n / math.factorial(n))
+    return jnp.stack(found)
+
+
 def echo(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K ny ..."], dt: float
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], dt: float
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its rates jumped; jumps: the latest first."""
+    """Return what every sensor still shows of the time before its derivatives jumped; jumps: the latest first."""
     age, faded = _faded(d, tau, len(jumps), dt)
-    return jnp.sum((tau[None] * faded - jnp.minimum(age, 0.0)) * jumps, axis=0)
+    behind = signed_moments(jnp.maximum(-age, 0.0), jnp.broadcast_to(tau[None], age.shape))
+    return -jnp.sum(jnp.swapaxes(behind, 0, 1) * faded[:, None] * jumps, axis=(0, 1))
 
 
-def echo_of_curvature(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K ny ..."], dt: float
-) -> Float[Array, "ny ..."]:
-    """Return the same of jumps of the second derivative."""
-    age, faded = _faded(d, tau, len(jumps), dt)
-    ahead = jnp.maximum(-age, 0.0)
-    return jnp.sum((0.5 * ahead**2 + ahead * tau[None] + tau[None] ** 2 * faded) * jumps, axis=0)
+def _in_time(function: Callable[..., Array], rate: Callable[..., Array], rise: Array) -> Callable[..., Array]:
+    """Return the derivative in time of a function of states and inputs, along the motion."""
+    return lambda x, u: jax.jvp(function, (x, u), (rate(x, u), rise))[1]
 
 
 def _faded(d: Array, tau: Array, count: int, dt: float) -> tuple[Array, Array]:

@@ -87,7 +87,7 @@ def test_the_next_reading(sensor: str, tau: float, d: float, between_rows: str) 
 
 
 @pytest.mark.parametrize("kind", ["lag", "delay"])
-def test_of_the_third_order_along_a_free_motion(kind: str) -> None:
+def test_what_is_left_is_of_the_fourth_order_along_a_free_motion(kind: str) -> None:
     """Both directions are of the same series, so what is left is its next term."""
     errors = []
     for late in (0.1, 0.05):
@@ -97,7 +97,7 @@ def test_of_the_third_order_along_a_free_motion(kind: str) -> None:
         x = np.concatenate([seen[40:-1, None], states[40:-1, 1:], np.zeros((39, 4))], axis=1)
         y = np.asarray(jax.jit(jax.vmap(step, in_axes=(0, None)))(jnp.asarray(x), jnp.zeros(0)))
         errors.append(np.abs(y[:, 0] - np.diff(seen[40:])).max())
-    assert 6 < errors[0] / errors[1] < 12
+    assert 12 < errors[0] / errors[1] < 24
 
 
 def test_the_rows_of_an_episode() -> None:

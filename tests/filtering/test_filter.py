@@ -79,7 +79,7 @@ def test_the_likelihood_is_that_of_the_exact_gaussian(plan: Setup, missing: tupl
 
 
 @pytest.mark.parametrize(("late", "lag"), [(0.0, 1.0), (1.0, 0.0), (1.0, 1.0)])
-def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: float) -> None:
+def test_late_and_lagging_sensors_are_right_to_third_order(late: float, lag: float) -> None:
     """Against exp(-d s)/(1 + tau s) on the exponential with which v settles, which has a closed form."""
     effects = [
         Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
@@ -91,7 +91,7 @@ def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: fl
     inputs = jnp.full((plan.lead + ROWS, 1), u)
     deaf, still_there = Noise(jnp.full(2, 1e6), jnp.zeros(2)), (jnp.array([0.0, v_0]), jnp.full(2, 1e-9))
     errors = []
-    for t in (0.02, 0.01):
+    for t in (0.16, 0.08):
         p = p_of_plan(plan, A, B)
         p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late * t, lag * t
         rows = jnp.zeros((ROWS, 2))
@@ -99,8 +99,8 @@ def test_late_and_lagging_sensors_are_right_to_second_order(late: float, lag: fl
         read = -np.asarray(track.innovation)[2:, 1]
         motion = np.exp(-A * (np.arange(2, ROWS) * DT - late * t)) / (1 - A * lag * t)
         errors.append(np.abs(read - (end + (v_0 - end) * motion)).max())
-    assert errors[0] < 5e-5
-    assert 6 < errors[0] / errors[1] < 10  # third order in the time
+    assert errors[0] < 2e-3
+    assert 9 < errors[0] / errors[1] < 20  # fourth order in the time
 
 
 def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> None:

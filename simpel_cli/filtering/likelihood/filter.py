@@ -35,7 +35,7 @@ from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import Timing, pushes_of
-from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, no_jumps, pushed, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, moving, no_jumps, pushed, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
@@ -177,13 +177,12 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
-    def moving(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
-        """Return the motion at a point of a row; u: of its substeps. What is held jumps, others rise or fall in it."""
-        bend = applied(rate_x, rate)
-        if linear and late_ones:
-            first, last = (plain_rates(x, end, p) for end in (u[0, 0], u[-1, -1]))
-            bend = bend + (last - first) / (substeps * length(u[0, 0]))
-        return Motion(rate, bend)
+    def moving_in(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
+        """Return the motion at a point of a row; u: of its substep. What is held jumps, others rise or fall in it."""
+        if not (linear and late_ones):
+            return moving(rate, rate_x)
+        first, last = (plain_rates(x, end, p) for end in (u[0], u[-1]))
+        return moving(rate, rate_x, (last - first) / length(u[0]))
 
     def seen(
         p: Array,
@@ -238,7 +237,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), motion, rate_x, jumps, begin)
             before = (motion, jumps) if late_ones else (None, None)
             if late_ones:
-                jumps = pushed(jumps, prompt, motion, moving(p, x, u_k, *rates(x, u_k[0, 0], p)))
+                jumps = pushed(jumps, prompt, motion, moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p)))
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
@@ -253,11 +252,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
             held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, *passed, *before)
             begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
+            motion = moving_in(p, following, u_k[-1], rate_after, rate_x_after)
+            if late_ones:
+                step = dt if pace is None else dt * pace[None]
+                motion = motion.since(moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p)), step)
             carry = (
                 following,
                 after(cov, jacobian, of_row(half, pace), sure),
                 u_k[-1, -1],
-                moving(p, following, u_k, rate_after, rate_x_after),
+                motion,
                 rate_x_after,
                 jumps,
                 begin,
@@ -266,7 +269,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
         first = u_sub[0, 0, 0]
         rate, rate_x = rates(start, first, p)
-        motion = moving(p, start, u_sub[0], rate, rate_x)  # as if it had been going on so
+        motion = moving_in(p, start, u_sub[0, 0], rate, rate_x)  # as if it had been going on so
         begin = (start, diagonal(spread), first, motion, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
         return jax.lax.scan(row, begin, (y, counted(ok), u_sub))[1]
 
@@ -285,9 +288,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
             now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
         if late_ones:
-            (d, tau), motion = late_by(p), moving(p, x, u_before, *rates(x, end, p))
+            (d, tau), motion = late_by(p), moving_in(p, x, u_before[-1], *rates(x, end, p))
+            begun = moving_in(p, x_before, u_before[0], *rates(x_before, u_before[0, 0], p))
+            motion = motion.since(begun, dt if pace is None else dt * pace[None])
             now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt)
-            jumps = pushed(jumps, slope, motion, moving(p, x, u, *rates(x, u[0, 0], p)))
+            jumps = pushed(jumps, slope, motion, moving_in(p, x, u[0], *rates(x, u[0, 0], p)))
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})

@@ -5,42 +5,61 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.late_readings import JUMPS, echo, echo_of_curvature
+from simpel_cli.dynamics.late_readings import JUMPS, ORDERS, echo, signed_moments
+from simpel_cli.filtering.likelihood.small_matrices import applied
 
-__all__ = ["JUMPS", "Motion", "back", "no_jumps", "pushed", "still_shown"]
+__all__ = ["JUMPS", "Motion", "back", "moving", "no_jumps", "pushed", "still_shown"]
 
 
 class Motion(NamedTuple):
-    """How the states move at a point in time: their rates and those rates' rates; or derivatives of these.
+    """How the states move at a point in time: their first three derivatives in time; or derivatives of these.
 
-    The latter are A f for states, A: slope of the rates f, and where inputs rise or fall between rows what that adds.
+    The second and the third are A f and A A f for states, A: slope of the rates f, and what inputs add that move between rows.
+    `rest` is what the slope's own change adds to the third: a difference of the second over the row before.
     """
 
     rate: Float[Array, "nx ..."]
     bend: Float[Array, "nx ..."]
+    turn: Float[Array, "nx ..."]
+    rest: Float[Array, "nx ..."]
+
+    @property
+    def orders(self) -> Float[Array, "orders nx ..."]:
+        """All three; of a motion that goes on as before, the third with its rest."""
+        return jnp.stack([self.rate, self.bend, self.turn + self.rest])
+
+    def since(self, begin: "Motion", step: Array | float) -> "Motion":
+        """Return this motion at the end of a row, with its rest; `begin`: of the row; `step`: its length, s."""
+        return self._replace(rest=(self.bend - begin.bend) / step - (self.turn + begin.turn) / 2)
+
+
+def moving(rate: Array, rate_x: Array, driven: Array | float = 0.0) -> Motion:
+    """Return a motion without a rest; `driven`: what inputs that move add to the second derivative."""
+    bend = applied(rate_x, rate) + driven
+    return Motion(rate, bend, applied(rate_x, bend), jnp.zeros_like(rate))
 
 
 def back(d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], motion: Motion) -> Float[Array, "ny nx ..."]:
     """Return how far every sensor looks back along the smooth motion, in the states."""
-    d, tau = d[:, None], tau[:, None]
-    return -(d + tau) * motion.rate[None] + (0.5 * d**2 + d * tau + tau**2) * motion.bend[None]
+    return jnp.sum(signed_moments(d, tau)[:, :, None] * motion.orders[:, None], axis=0)
 
 
 def pushed(
-    jumps: Float[Array, "K 2 ny ..."], prompt: Float[Array, "ny nx ..."], before: Motion, now: Motion
-) -> Float[Array, "K 2 ny ..."]:
+    jumps: Float[Array, "K orders ny ..."], prompt: Float[Array, "ny nx ..."], before: Motion, now: Motion
+) -> Float[Array, "K orders ny ..."]:
     """Add the jump at the start of a row, where a motion goes over into another; prompt: slope of the sensors."""
-    latest = jnp.stack([jnp.sum(prompt * (to - was)[None], axis=1) for was, to in zip(before, now, strict=True)])
+    each = zip(before[:ORDERS], now[:ORDERS], strict=True)
+    latest = jnp.stack([jnp.sum(prompt * (to - was)[None], axis=1) for was, to in each])
     return jnp.concatenate([latest[None], jumps[:-1]])
 
 
-def no_jumps(ny: int, x: Float[Array, "nx ..."]) -> Float[Array, "K 2 ny ..."]:
+def no_jumps(ny: int, x: Float[Array, "nx ..."]) -> Float[Array, "K orders ny ..."]:
     """Return the start of a record, before which nothing jumped."""
-    return jnp.zeros((JUMPS, 2, ny, *x.shape[1:]), x.dtype)
+    return jnp.zeros((JUMPS, ORDERS, ny, *x.shape[1:]), x.dtype)
 
 
 def still_shown(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K 2 ny ..."], dt: float
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], dt: float
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its rates and their rates jumped; jumps: the latest first."""
-    return echo(d, tau, jumps[:, 0], dt) - echo_of_curvature(d, tau, jumps[:, 1], dt)
+    """Return what every sensor still shows of the time before its motion jumped; jumps: the latest first."""
+    return echo(d, tau, jumps, dt)

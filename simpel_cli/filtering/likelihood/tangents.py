@@ -26,7 +26,7 @@ from simpel_cli.filtering.likelihood.clock import early_of
 from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import SMALL, Timing
-from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, pushed, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, moving, pushed, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
@@ -194,11 +194,10 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
 
         What a push adds to the rates' rates beside inputs that rise is by how much it grows in the row; else it is held.
         """
-        bend = applied(rate_x, rate)
-        if timing.rising and push is not None and push.first is not None:
-            step = dt if pace is None else dt * pace[None]
-            bend = bend + (_there(push.end) - push.first) / step
-        return Motion(rate, bend)
+        if not (timing.rising and push is not None and push.first is not None):
+            return moving(rate, rate_x)
+        step = dt if pace is None else dt * pace[None]
+        return moving(rate, rate_x, (_there(push.end) - push.first) / step)
 
     return slopes
 

@@ -37,7 +37,7 @@ class Held(NamedTuple):
     stages: Float[Array, "T substeps 3 nx ..."]  # states at the beginning, in the middle and at the end of a substep
     stage_x: Float[Array, "T substeps 3 nx nx ..."]  # slope of the rates there
     motion: Any  # `Motion` at the end of the row before, (T, nx, ...) each; None: no sensor is late
-    jumps: Float[Array, "T K 2 ny ..."] | None  # of what the sensors read, before the row; None: no sensor is late
+    jumps: Float[Array, "T K orders ny ..."] | None  # of what the sensors read, before the row; None: no sensor is late
 
 
 class Ways(NamedTuple):
@@ -91,8 +91,8 @@ class Filter(NamedTuple):
         flow: (p, x, u of the substeps, (substeps, K, nu)) -> x one row later.
         measure: (p, x, u) -> what the sensors read.
         read: (p, x of the row before, its u of the substeps, x, u of the substeps, jumps) -> what is read in a row, of which
-            each value may have been measured before it, and the jumps of the rates and of theirs before the next row, which
-            late sensors still show: (JUMPS, 2, ny), 0 before the first row.
+            each value may have been measured before it, and the jumps of its motion before the next row, which
+            late sensors still show: (JUMPS, ORDERS, ny), 0 before the first row.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
             and end; what stands behind the inputs, behind them.
         remainders: rows of the state that are no part of a simulation (see `remainders.py`).
@@ -104,6 +104,6 @@ class Filter(NamedTuple):
     slopes: Callable[..., tuple[Float[Array, "D T ny"], Float[Array, "D T ny"]]]
     flow: Callable[..., Float[Array, " nx"]]
     measure: Callable[..., Float[Array, " ny"]]
-    read: Callable[..., tuple[Float[Array, " ny"], Float[Array, "K 2 ny"]]]
+    read: Callable[..., tuple[Float[Array, " ny"], Float[Array, "K orders ny"]]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
     remainders: tuple[int, ...] = ()
