@@ -38,7 +38,7 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
     ]
     kind = truth["kind"]
     if kind == "none":
-        return FALSE if claimed else RIGHT if found["verdict"] == "none" else UNEXPLAINED
+        return FALSE if claimed else UNEXPLAINED if found["verdict"] == "unexplained" else RIGHT
     if kind == "outside":
         if claimed:
             return RIGHT if found["remainder"] else WRONG

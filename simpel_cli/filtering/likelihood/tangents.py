@@ -10,6 +10,10 @@ since the gain K is optimal: its own change drops out of dP+. A level of noise i
 parameter, for which the Jacobian F of a row follows to second order in dt. A large model holds its gains where a parameter
 moves, as the innovations form of a prediction-error method does.
 
+Of what a late sensor reads, the slope A of the rates is held, and with it the rest of the third order: up to a tenth of a
+derivative (`tests/filtering/test_tangents.py`). That does not bias a fit: what is left at the true parameters is noise,
+whatever it is weighed with, as with instruments in place of slopes (Ljung 1999, ch. 7.6).
+
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised); Ljung
 (1999), System identification, ch. 7.
 """
