@@ -1,11 +1,11 @@
 """What an input does between rows, as the share of every row in it: a sum of one kernel about each row.
 
-A held input is a sum of boxes that begin at their rows, a linear one of hats, and a smooth one of the kernel of cubic
-convolution, which puts a cubic into each row, with the slopes of central differences. What an input is over a substep, its mean
-and its first moment, are differences of the kernel's integrals, exact and continuous in a delay.
+A held input is a sum of boxes that begin at their rows, a linear one of hats, and a smooth one of a kernel that puts a cubic
+into each row, with the slopes there of polynomials through five rows. What an input is over a substep, its mean and its first
+moment, are differences of the kernel's integrals, exact and continuous in a delay.
 
-Reference: Keys (1981), Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (kernel with a = -1/2,
-and the parabola beyond both ends).
+Reference: Keys (1981), Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (kernels of piecewise
+cubics, of which this one has slopes of fourth order in the distance of rows; the parabola beyond both ends).
 """
 
 from typing import NamedTuple
@@ -52,11 +52,24 @@ class Kernel(NamedTuple):
         return jnp.diff(area, axis=0) / h, 12 * moment / h**2
 
 
+def _of_cubics(slopes: tuple[float, ...]) -> Kernel:
+    """Return the kernel of cubics through the rows; slopes: share of the rows around in the slope at the middle one."""
+    half, pieces = len(slopes) // 2, []
+    for row in range(half + 1, -half - 1, -1):  # that many rows from the beginning of a piece
+        begin, end = (slopes[k + half] if abs(k) <= half else 0.0 for k in (row, row - 1))
+        value = [float(row == 0), 0.0, 3.0 * ((row == 1) - (row == 0)), 2.0 * ((row == 0) - (row == 1))]
+        pieces.append((value[0], begin, value[2] - 2 * begin - end, value[3] + begin + end))
+    return Kernel(-half - 1, tuple(pieces))
+
+
 KERNELS = {
     HELD: Kernel(0, ((1.0,),)),
     LINEAR: Kernel(-1, ((0.0, 1.0), (1.0, -1.0))),
-    SMOOTH: Kernel(-2, ((0.0, 0.0, -0.5, 0.5), (0.0, 0.5, 2.0, -1.5), (1.0, 0.0, -2.5, 1.5), (0.0, -0.5, 1.0, -0.5))),
+    SMOOTH: _of_cubics((1 / 12, -8 / 12, 0.0, 8 / 12, -1 / 12)),
 }
+REACH = {
+    word: (kernel.first + len(kernel.pieces) - 1, -kernel.first) for word, kernel in KERNELS.items()
+}  # rows before, behind
 
 
 def beyond(u: Float[Array, "rows *nu"]) -> Float[Array, " *nu"]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.between_rows import KERNELS, beyond
+from simpel_cli.dynamics.between_rows import KERNELS, REACH, beyond
 from simulators.quantity import HELD, LINEAR, SMOOTH
 
 STAGES = (-0.5, 0.0, 0.5)  # of a Runge-Kutta step: beginning, middle and end, from the middle of a substep
@@ -56,10 +56,12 @@ def delayed_inputs(
         straight = jnp.array([float(i in linear) for i in range(u.shape[1])], u.dtype)
         straight = straight if way is None else straight * jnp.minimum(2 * way, 1.0)
         u = slewed(u, slowness, dt, straight if linear else None)
-    rows, curved = u.shape[0] - bool(linear), bool(smooth) or way is not None
-    ahead, behind = int(bool(linear)) + curved, lead + curved  # rows near a row that have a share in it
+    rows = u.shape[0] - bool(linear)
+    most = SMOOTH if smooth or way is not None else LINEAR if linear else HELD
+    past, ahead = REACH[most]
+    behind = lead + past  # rows near a row that have a share in it
     before = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])  # before the record the first input was held
-    if curved:  # a row more at both ends; what it is matters to the first and the last row only
+    for _ in range(past):  # what is beyond both ends matters to the first and the last rows only
         before = jnp.concatenate([beyond(before[::-1])[None], before, beyond(before)[None]])
     near = before[jnp.arange(rows)[:, None] + jnp.arange(behind + 1 + ahead)[None]]
     order = jnp.arange(1, rows * substeps + 1, dtype=u.dtype)

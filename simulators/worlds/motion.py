@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import casadi
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, KroghInterpolator
 
 from simulators.model import TIE, Model, ModelError
 from simulators.quantity import HELD, LINEAR, SMOOTH
@@ -58,7 +58,7 @@ class Inputs(NamedTuple):
     def of_rows(cls, times: np.ndarray, values: np.ndarray, words: Sequence[str]) -> "Inputs":
         """Return inputs that are given in rows, `held`, `linear` or `smooth` in between.
 
-        A smooth one is a cubic in each row, with the slopes of parabolas through three rows, drawn in short straight lines.
+        A smooth one is a cubic in each row, with the slopes of polynomials through five rows, drawn in short straight lines.
         """
         moving, rows = np.array([word != HELD for word in words], bool), values.shape[1]
         if SMOOTH not in words or rows < PARABOLA:
@@ -69,7 +69,7 @@ class Inputs(NamedTuple):
         found = np.zeros((*fine.shape, len(words)))
         for k, i in np.ndindex(len(times), len(words)):
             if words[i] == SMOOTH:
-                slopes = np.gradient(values[k, :, i], times[k], edge_order=2)
+                slopes = _slopes(times[k], values[k, :, i])
                 found[k, :, i] = CubicHermiteSpline(times[k], values[k, :, i], slopes)(fine[k])
             elif words[i] == LINEAR:
                 found[k, :, i] = np.interp(fine[k], times[k], values[k, :, i])
@@ -98,6 +98,20 @@ class Inputs(NamedTuple):
         None is late: the inputs as they are given.
         """
         return self.course(t + tie, np.zeros((len(t), self.values.shape[2])) if late is None else late).at(t)
+
+
+def _slopes(t: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the slopes at rows of polynomials through five rows; beyond both ends lies the parabola of the last three."""
+    step = np.ptp(t) / (len(t) - 1)
+    more = step * np.arange(1, 3)
+    ends = (t[:PARABOLA], u[:PARABOLA], t[0] - more[::-1]), (t[-PARABOLA:], u[-PARABOLA:], t[-1] + more)
+    first, last = (KroghInterpolator(own, values)(at) for own, values, at in ends)
+    t, u = np.concatenate([ends[0][2], t, ends[1][2]]), np.concatenate([first, u, last])
+    near = np.arange(len(t) - 4)[:, None] + np.arange(5)
+    far = (t[near] - t[2:-2, None]) / step
+    powers = far[:, None] ** np.arange(5)[None, :, None]
+    weights = np.linalg.solve(powers, np.broadcast_to(np.eye(5)[:, 1:2], (len(far), 5, 1)))[..., 0]
+    return np.asarray(np.sum(weights * u[near], axis=1) / step)
 
 
 class Drifting(NamedTuple):
