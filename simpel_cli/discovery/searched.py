@@ -16,6 +16,7 @@ from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_i
 from simpel_cli.discovery.search.by_group.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.gate.held_out import Gate
+from simpel_cli.discovery.search.gate.long_runs import harmless_in_long_runs
 from simpel_cli.discovery.search.integration import Finer, too_coarse
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
@@ -27,7 +28,7 @@ from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, ti
 from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, stands_for
 from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.uses import ONE_STEP
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, windows_for
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.cleaning import outlier_check
@@ -334,6 +335,9 @@ def _with(
             return by_simulations._replace(earlier=chosen_of(found, selection))
         if by_simulations is not None:
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
+    if by_simulations is None and selection.chosen.terms and not ground.budget.over("free runs of whole episodes"):
+        runs = windows_for(plan, ground.clean.recording, FREE_RUN)
+        selection, gates = harmless_in_long_runs(search, assessor, selection, gates, runs, terminal)
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)

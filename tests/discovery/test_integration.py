@@ -130,6 +130,12 @@ def test_a_smooth_effect_asks_for_none() -> None:
     assert asked(measured(1e-3, drag=0.5), DRAG)[0] is None
 
 
+def test_a_stiff_smooth_effect_asks_for_twice_as_many() -> None:
+    stiff = {"k": {"range": [0, 20], "unit": "1/s", "starts": [5.0]}}
+    drag = Expression("drag", acts_on="v", term="-k*v", parameters=stiff)
+    assert asked(measured(1e-3, drag=8.0), drag)[0] == Finer(steps=2)
+
+
 def test_steps_are_not_asked_for_without_end(rubbing: Recording) -> None:
     assert asked(rubbing, DRY, MOST)[0] is None
 

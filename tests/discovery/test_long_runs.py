@@ -1,0 +1,88 @@
+"""An effect that helps in the windows of a search, and does harm in a free run of a whole episode."""
+
+import numpy as np
+import pytest
+
+from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.search.acceptance import gated_selection
+from simpel_cli.discovery.search.gate.long_runs import harmless_in_long_runs
+from simpel_cli.discovery.search.sets.forward import selected
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.uses import FREE_RUN, windows_for
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup, with_memory
+from simpel_cli.runs.console import Terminal
+from simulators.effects import Expression
+from simulators.model import Declared
+
+DT, TRAIN, ROWS, NOISE, MEMORY = 0.1, 4000, 4500, 0.01, 2.0
+TAU = {"range": [3 * DT, 3000 * DT], "unit": "s", "prior": "loguniform", "neutral": 3.0, "starts": [2.0, 100.0]}
+SLOW = Expression(
+    "slow", acts_on="x", term="k*z", parameters={"k": {"range": [-3, 3], "unit": "1/s", "starts": [0.3]}, "tau": TAU},
+    states={"z": {"rate": "(given - z)/tau", "unit": "U", "range": ["-U", "U"], "begins": "given"}},
+)  # fmt: skip
+
+
+def recording() -> Recording:
+    """A first-order lag with one more state behind its input."""
+    random = np.random.default_rng(2)
+    u = np.repeat(random.uniform(-1, 1, ROWS // 10), 10)
+    h = DT / 20
+    x, z, rows = 0.0, 0.0, []
+    for k in range(ROWS):
+        rows.append(x)
+        for _ in range(20):
+            x, z = x + h * (u[k] - x + 0.5 * z), z + h * (u[k] - z) / MEMORY
+    read = np.array(rows) + NOISE * random.normal(size=ROWS)
+    time, parts = DT * np.arange(ROWS), [slice(0, TRAIN), slice(TRAIN, ROWS)]
+    train, test = (
+        Episode(str(k), time[own], read[own, None], u[own, None], np.zeros((own.stop - own.start, 0)))
+        for k, own in enumerate(parts)
+    )
+    return Recording((train,), (test,), (), {"x": NOISE}, (), (), ())
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[Recording, Search, Assessor, Trial]:
+    model = Declared(
+        "lag", dt=DT, states={"x": {"unit": "1", "range": [-2, 2]}}, inputs={"u": {"unit": "1", "range": [-1, 1]}},
+        parameters={"a": {"unit": "1/s", "range": [0.5, 2]}}, dynamics={"x": "u - a*x"},
+    ).model()  # fmt: skip
+    data = recording()
+    plan = setup(model, data, (), [], 1, extra=with_memory(model, data, [SLOW]))
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=10))
+    (slow,) = (t for t, term in enumerate(search.terms) if term.effect == "slow")
+    return data, search, Assessor(plan, 10), search.add(search.base(), [slow]).trials[0]
+
+
+@pytest.mark.parametrize("harm", [True, False])
+def test_what_goes_astray_over_whole_episodes_goes(
+    found: tuple[Recording, Search, Assessor, Trial], harm: bool
+) -> None:
+    data, search, assessor, chosen = found
+    terminal = Terminal(quiet=True)
+    selection = selected(search, search.base(), 0, (search.base(), chosen), settled=True)
+    selection, gates, _ = gated_selection(search, assessor, selection, terminal)
+    assert selection.chosen.terms == chosen.terms
+    if harm:  # as a start of every window's own may hide
+        z = selection.chosen.optimum.z.copy()
+        (k,) = (
+            i for i, q in enumerate(search.plan.augmented.params) if q.name.startswith("slow") and q.name.endswith("k")
+        )
+        z[k] = 1 - z[k]
+        worse = Trial(chosen.terms, selection.chosen.optimum._replace(z=z))
+        selection = selection._replace(chosen=worse, path=(*selection.path[:-1], worse))
+    runs = windows_for(search.plan, data, FREE_RUN)
+    after, left = harmless_in_long_runs(search, assessor, selection, gates, runs, terminal)
+    assert (after.chosen.terms == ()) == (left == []) == (set(chosen.terms) <= search.banned) == harm
+    search.banned -= set(chosen.terms)
+
+
+def test_windows_as_long_as_the_episodes_are_not_looked_at_again(
+    found: tuple[Recording, Search, Assessor, Trial],
+) -> None:
+    _, search, assessor, chosen = found
+    selection = selected(search, search.base(), 0, (search.base(), chosen), settled=True)
+    same = harmless_in_long_runs(search, assessor, selection, [], search.plan.windows, Terminal(quiet=True))
+    assert same == (selection, [])
