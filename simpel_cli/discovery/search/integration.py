@@ -25,6 +25,7 @@ from simpel_cli.filtering.likelihood.augmented import Augmented
 
 MOST = 8  # steps a row, at which one that switches is integrated as well as it will be
 NOTHING = 0.1  # of what an effect has to earn: what is missed then is left
+FALLS = 50.0  # times what is missed falls with twice as many steps where all is smooth; 256 in the end, of one that switches 16
 VERY_MANY = 32
 ROWS = 1000  # looked at
 LOST = 1e6  # variances that a row counts at most
@@ -33,8 +34,8 @@ LOST = 1e6  # variances that a row counts at most
 class Finer(NamedTuple):
     """A search worth making with more integration steps a row.
 
-    They are twice as many where these miss nothing, as of a smooth effect, whose error falls with the fourth power; else `MOST`
-    at once: beside noise of the process that makes up for coarse steps, a little finer ones look fine.
+    They are as many as miss nothing where the effect is smooth, so that errors fall with the fourth power; else `MOST` at once:
+    beside noise of the process that makes up for coarse steps, a little finer ones look fine.
 
     Args:
         earlier: what was chosen with fewer.
@@ -66,7 +67,14 @@ def too_coarse(search: Search, assessor: Assessor, trial: Trial, base: Trial) ->
 
     if missed(trial, steps) <= ACCEPT + missed(base, steps):
         return None
-    return Finer(steps=2 * steps if missed(trial, 2 * steps) < NOTHING * ACCEPT else MOST)
+    more = steps
+    while (more := 2 * more) < MOST:
+        left = missed(trial, more)
+        if left * FALLS > missed(trial, more // 2):
+            break
+        if left < NOTHING * ACCEPT:
+            return Finer(steps=more)
+    return Finer()
 
 
 def _missed(search: Search, assessor: Assessor, trial: Trial, steps: int) -> float:
