@@ -73,8 +73,8 @@ def grouping(q: Quantity, by: str, names: tuple[str, ...], spread: tuple[float, 
         names: of the groups.
         spread: range of the spread; None: from 0 to half of the range of the parameter.
     """
-    ratio = q.low >= 0 or q.high <= 0
-    low, high = spread or (0.0, _most(q, ratio=ratio))
+    ratio = is_factor(q)
+    low, high = spread or (0.0, largest_spread(q))
     members = tuple(
         Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER) for word in words((*names, UNSEEN))
     )
@@ -185,9 +185,14 @@ def words(names: tuple[str, ...]) -> list[str]:
     return found
 
 
-def _most(q: Quantity, *, ratio: bool) -> float:
-    """Largest spread: half of the range, so that two standard deviations reach over all of it and more."""
-    if not ratio:
+def is_factor(q: Quantity) -> bool:
+    """Whether groups differ by a factor, as where the parameter has one sign; else by something that is added."""
+    return q.low >= 0 or q.high <= 0
+
+
+def largest_spread(q: Quantity) -> float:
+    """Return half of the range, so that two standard deviations reach over all of it and more; of a factor, its logarithm."""
+    if not is_factor(q):
         return (q.high - q.low) / 2
     ends = sorted((abs(q.low), abs(q.high)))
     return math.log(ends[1] / ends[0]) / 2 if ends[0] > 0 else OF_ZERO

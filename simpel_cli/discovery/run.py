@@ -17,7 +17,7 @@ from simpel_cli.discovery.next_experiment.design import next_experiment
 from simpel_cli.discovery.next_experiment.determining import determining_experiments
 from simpel_cli.discovery.search.between_rows import MOVES, Preference, sentence_of
 from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grouping
-from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, written
+from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, said_of_groups, written
 from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
 from simpel_cli.discovery.search.settings import Discovery
@@ -190,7 +190,8 @@ def _correct(
     nowhere += [f"the range of {b.name} ({IN_PYTHON})" for b in outside if b.name not in declared_in(config["sim"])]
     changes = len(per) + len(outside)
     said = ranges_of(outside)
-    said |= {name: said.get(name, {}) | {"per": by} for name, by in per.items()}
+    own = said_of_groups(model, per, found["groups"])
+    said |= {name: said.get(name, {}) | keys for name, keys in own.items()}
     if not found["effects"] and len(nowhere) == changes:
         return {"corrected_sim_lacks": nowhere}
     name, node, left_out = corrected(written(config["sim"], said), model, searched.search, searched.selection.chosen)

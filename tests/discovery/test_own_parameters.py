@@ -15,7 +15,7 @@ from test_effects_by_group import CART, DATA
 
 from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.by_group import strangers
-from simpel_cli.discovery.search.by_group.own_parameters import _can_differ, with_own, written
+from simpel_cli.discovery.search.by_group.own_parameters import _can_differ, said_of_groups, with_own, written
 from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.smaller import small_search
 from simpel_cli.discovery.search.trials import Search, Trial
@@ -191,3 +191,24 @@ def test_a_rig_that_was_never_seen_is_predicted_as_one_of_many(tmp_path: Path) -
     for horizon, errors in verdict["error"]["before"].items():
         if horizon != "log_likelihood_per_step":
             assert all(verdict["error"]["after"][horizon][name] < 1.05 * e for name, e in errors.items())
+
+
+def test_groups_may_differ_by_more_than_what_is_known_of_all() -> None:
+    """A motor's constant that a data sheet gives to 2 % differs from motor to motor by a tenth."""
+    parameters: dict[str, Any] = {
+        "k": {"unit": "1", "range": [3.92, 4.08]}, "m": {"unit": "1", "range": [40, 160]},
+        "f": {"unit": "1", "range": [-0.1, 0.1]}, "d": {"unit": "1", "range": [1, 1.1], "per": "rig", "spread": [0, 0.02]},
+    }  # fmt: skip
+    model = Declared(
+        "cart", dt=0.1, states={"v": {"unit": "1", "range": [-1, 1]}}, inputs={"u": {"unit": "1", "range": [-1, 1]}},
+        parameters=parameters, dynamics={"v": "k*u - m*v + f - d"},
+    ).model()  # fmt: skip
+    model = grouped(model, {"rig": ("a", "b")})
+    differing = with_own(model, dict.fromkeys("kmf", "rig"))
+    widest = {q.name: q.high for q in differing.params if q.name.endswith("_spread")}
+    assert widest == pytest.approx({"k_spread": 0.35, "m_spread": np.log(4) / 2, "f_spread": 0.1, "d_spread": 0.02})
+    groups = [
+        {"parameter": name, "effect": None, "spread": {"high": high}} for name, high in (("k", 0.1234), ("m", 0.5))
+    ]
+    said = said_of_groups(model, dict.fromkeys("km", "rig"), groups)
+    assert said == {"k": {"per": "rig", "spread": [0.0, 0.123]}, "m": {"per": "rig"}}

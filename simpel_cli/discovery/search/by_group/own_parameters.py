@@ -19,10 +19,11 @@ from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.filtering.tracks import Tracks
-from simulators.groups import SPREAD, grouped, spreads_of
+from simulators.groups import SPREAD, grouped, is_factor, largest_spread, spreads_of
 from simulators.model import Model, ModelError
 
 MOST_AT_ONCE = 3  # parameters that differ by one column: what the program has room for
+WIDE = 0.35  # spread of the logarithm that is asked at least: a factor of two at two standard deviations
 
 Attach = Callable[..., Setup]  # (model, kept, extra) -> the setup of a program with these terms alone
 
@@ -30,13 +31,36 @@ Attach = Callable[..., Setup]  # (model, kept, extra) -> the setup of a program 
 def with_own(model: Model, per: Mapping[str, str]) -> Model:
     """Return the simulator whose parameters differ from group to group as it says itself, and these as well.
 
+    A range says where the common value is. Groups may differ by more than that where nobody said that they differ at all.
+
     Args:
         model: of measurements with groups.
         per: parameter -> column of the groups.
     """
-    assert model.base is not None
-    base = replace(model.base, per={**model.base.per, **per}, between_rows=model.between_rows, latency=model.latency)
-    return grouped(base, model.groups)
+    base = model.base
+    assert base is not None
+    narrow = [q for q in base.params if q.name in per and q.name not in base.per and q.name not in base.spreads]
+    wide = {q.name: (0.0, WIDE) for q in narrow if is_factor(q) and largest_spread(q) < WIDE}
+    between, late = model.between_rows, model.latency
+    per, spreads = {**base.per, **per}, {**base.spreads, **wide}
+    return grouped(replace(base, per=per, spreads=spreads, between_rows=between, latency=late), model.groups)
+
+
+def said_of_groups(model: Model, per: Mapping[str, str], groups: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what the YAML of a simulator says of its parameters that differ: parameter -> `per`, and `spread` if it is wide.
+
+    Args:
+        model: as it was declared.
+        per: parameter -> column of the groups.
+        groups: as in `verdict.json`.
+    """
+    found: dict[str, Any] = {name: {"per": by} for name, by in per.items()}
+    usual = {q.name: largest_spread(q) for q in (model.base or model).params}
+    for one in groups:
+        name, most = one["parameter"], one["spread"]["high"]
+        if name in found and not one["effect"] and most > usual.get(name, most):
+            found[name]["spread"] = [0.0, float(f"{most:.3g}")]
+    return found
 
 
 def own_parameters(
