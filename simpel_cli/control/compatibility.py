@@ -45,7 +45,8 @@ def check_compatible(
             isinstance(other, Model) and q.name in [other.inputs[k].name for k in other.linear],
         ]
         if ways[0] != ways[1]:
-            own_word, its_word = ("linear" if way else "held" for way in ways)
+            its_word = other.between_rows.get(q.name, "held") if isinstance(other, Model) else "held"
+            own_word = "held" if ways[1] else "linear or smooth"
             raise ConfigError(
                 f"{key}: {q.name} of {other.name} is {its_word} between rows; that of sim is {own_word}. Say the same of both "
                 f"(inputs.{q.name}.between_rows), or data.between_rows={{{q.name}: {its_word}}}."

@@ -65,8 +65,9 @@ class Measurements:
             of what they are resampled to.
         derived: states whose column was computed from another column, e.g. a speed that was differentiated from the
             position: `discover` does not take them for measurements. A plain difference is found without this.
-        between_rows: input -> `held` at the value of its row until the next, or `linear`, straight to the value of the next
-            row; in place of what the simulator says. Held where neither says anything (`discover` then compares both).
+        between_rows: input -> `held` at the value of its row until the next, `linear`, straight to the value of the next row,
+            or `smooth`, a curve through the rows; in place of what the simulator says. Held where neither says anything
+            (`discover` then compares all three).
         latency: state or output -> how old its value is when it is recorded, s: in a row at t is what was measured at
             t - latency. In place of `sim.outputs.y.delay`. Or [low, high]: `discover` estimates it.
         times: state or output -> column of the time at which it was measured, s, of a sensor with a clock of its own: its

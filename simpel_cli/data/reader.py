@@ -26,6 +26,7 @@ from simpel_cli.data.time_gaps import cut_at_gaps
 from simpel_cli.data.timing.when_measured import refuse_unplaced, when_measured
 from simpel_cli.errors import ConfigError, DataError
 from simulators.model import Model, Quantity
+from simulators.quantity import HELD
 
 
 def read(
@@ -67,12 +68,13 @@ def read(
     measurable = (*model.states, *model.outputs)
     names = tuple(q.name for q in measurable)
     config.check_names((*names, *(q.name for q in model.inputs)), names)
-    linear = model.linear if isinstance(model, Model) else ()
-    if linear and config.layout == "transitions":
-        name = model.inputs[linear[0]].name
+    moving = [i for i, word in enumerate(model.words_between_rows) if word != HELD] if isinstance(model, Model) else []
+    if moving and config.layout == "transitions":
+        assert isinstance(model, Model)
+        name, word = model.inputs[moving[0]].name, model.words_between_rows[moving[0]]
         key = "data" if name in config.between_rows else f"sim.inputs.{name}"
         raise ConfigError(
-            f"{key}.between_rows: {name} is linear, but the next value of an input is not known in layout 'transitions', whose "
+            f"{key}.between_rows: {name} is {word}, but the next value of an input is not known in layout 'transitions', whose "
             f"rows do not follow each other. Store trajectories, or set data.between_rows={{{name}: held}}."
         )
     files = read_files(config, model, base)

@@ -34,6 +34,7 @@ class Ground(NamedTuple):
         earlier: what was chosen before something else was known.
         simulated: likewise by simulations.
         remembering: effects with a state of their own that the program has room for.
+        finer: whether a search asked for the integration steps of `options`, not the user.
     """
 
     model: Model
@@ -47,6 +48,7 @@ class Ground(NamedTuple):
     earlier: Earlier | None = None
     simulated: Earlier | None = None
     remembering: tuple[Term, ...] = ()
+    finer: bool = False
 
     def attach(self, effects: list[Expression]) -> Callable[..., Setup]:
         """Return the function of a simulator that sets a search with these effects up."""

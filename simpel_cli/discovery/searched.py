@@ -8,7 +8,7 @@ from typing import NamedTuple
 from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
 from simpel_cli.discovery.last_calibration import last_calibration
-from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed, with_interactions
+from simpel_cli.discovery.search.acceptance import accepted, harmless, judgement, proposed, with_interactions
 from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
@@ -16,7 +16,6 @@ from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_i
 from simpel_cli.discovery.search.by_group.own_parameters import own_parameters, per_of, with_own
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated, prepared, with_heavy_tails
 from simpel_cli.discovery.search.gate.held_out import Gate
-from simpel_cli.discovery.search.gate.long_runs import harmless_in_long_runs
 from simpel_cli.discovery.search.integration import Finer, too_coarse
 from simpel_cli.discovery.search.ranges import MOST_WIDER, Wider, too_narrow, widened
 from simpel_cli.discovery.search.ranges import in_words as ranges_in_words
@@ -102,7 +101,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
         elif isinstance(found, Finer):
             terminal.line(f"these effects ask for {found.steps} integration steps a row: searching once more", "steps")
             options = replace(ground.options, substeps=found.steps)
-            ground = ground._replace(options=options, earlier=found.earlier)
+            ground = ground._replace(options=options, earlier=found.earlier, finer=True)
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
@@ -262,7 +261,8 @@ def _with(
 
     def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
         chosen = selection.chosen
-        if options.substeps is None and not (chosen.terms and ground.budget.over("finer integration steps")):
+        open_ = options.substeps is None or ground.finer
+        if open_ and not (chosen.terms and ground.budget.over("finer integration steps")):
             finer = too_coarse(search, assessor, chosen, selection.base)
             if finer is not None:
                 return finer
@@ -312,6 +312,10 @@ def _with(
     while True:
         judged = selection.chosen.terms
         selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
+        if selection.chosen.terms and not ground.budget.over("free runs of whole episodes"):
+            runs = windows_for(found.search.plan, ground.clean.recording, FREE_RUN)
+            use = options.for_ or ONE_STEP
+            selection, gates = harmless(found.search, assessor, selection, gates, runs, terminal, use)
         if selection.chosen.terms != judged and (first := unsound(found.search, selection)) is not None:
             return _told(first, found, selection)
         heavy = _heavy(found, assessor, selection, ground)  # which rivals may have been needed to tell
@@ -335,9 +339,6 @@ def _with(
             return by_simulations._replace(earlier=chosen_of(found, selection))
         if by_simulations is not None:
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
-    if by_simulations is None and selection.chosen.terms and not ground.budget.over("free runs of whole episodes"):
-        runs = windows_for(plan, ground.clean.recording, FREE_RUN)
-        selection, gates = harmless_in_long_runs(search, assessor, selection, gates, runs, terminal)
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
     levels = NoiseProfile(search, assessor, selection.chosen)

@@ -4,6 +4,8 @@ A held input is a sum of boxes that begin at their rows, a linear one of hats, a
 into each row, with the slopes there of polynomials through five rows. What an input is over a substep, its mean and its first
 moment, are differences of the kernel's integrals, exact and continuous in a delay.
 
+What a smooth input was before a record that begins with it is the parabola of its first rows, not the first value.
+
 Reference: Keys (1981), Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (kernels of piecewise
 cubics, of which this one has slopes of fourth order in the distance of rows; the parabola beyond both ends).
 """
@@ -40,6 +42,14 @@ class Kernel(NamedTuple):
             whole += sum(once)
         return area, twice + whole * jnp.maximum(t - (self.first + len(self.pieces)), 0.0)
 
+    def values(self, t: Array) -> Array:
+        """Return the kernel at t."""
+        found = jnp.zeros_like(t)
+        for k, piece in enumerate(self.pieces):
+            s = t - (self.first + k)
+            found = found + jnp.where((s >= 0) & (s < 1), _polynomial(piece, s), 0.0)
+        return found
+
     def shares(self, passed: Float[Array, "ends near"]) -> tuple[Array, Array]:
         """Return mean and rise, over every substep, of the kernel about every row; the rise keeps the first moment.
 
@@ -70,6 +80,23 @@ KERNELS = {
 REACH = {
     word: (kernel.first + len(kernel.pieces) - 1, -kernel.first) for word, kernel in KERNELS.items()
 }  # rows before, behind
+
+
+def begun_smoothly(u: Float[Array, "R nu"], lead: int, rows: int) -> Float[Array, "R nu"]:
+    """Return inputs whose record begins behind so many rows that repeat its first value, with a parabola in the last of these.
+
+    Args:
+        u: inputs; the first `lead` rows are the past.
+        lead: rows of the past; they are known, and stay, where one of them is another value.
+        rows: of the past that a smooth input reads.
+    """
+    still = jnp.all(u[:lead] == u[lead][None], axis=0)
+    record = u[lead:]
+    for k in range(min(rows, lead)):
+        before = beyond(record[::-1])
+        record = jnp.concatenate([before[None], record])
+        u = u.at[lead - 1 - k].set(jnp.where(still, before, u[lead - 1 - k]))
+    return u
 
 
 def beyond(u: Float[Array, "rows *nu"]) -> Float[Array, " *nu"]:

@@ -2,7 +2,8 @@
 
 A held input is a staircase; the mean over a substep that lies d in the past is a sum over samples, each weighted with the
 share of the substep that it fills: continuous in d, below one sample too. A linear or smooth input is such a sum of other
-kernels (`between_rows.py`); over a substep it is taken for the straight line that has its mean and its first moment.
+kernels (`between_rows.py`); over a substep a linear one is taken for the straight line that has its mean and its first moment,
+a smooth one for the parabola that is where it is at the beginning, in the middle and at the end.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.between_rows import KERNELS, REACH, beyond
+from simpel_cli.dynamics.between_rows import KERNELS, REACH, begun_smoothly, beyond
 from simulators.quantity import HELD, LINEAR, SMOOTH
 
 STAGES = (-0.5, 0.0, 0.5)  # of a Runge-Kutta step: beginning, middle and end, from the middle of a substep
@@ -60,10 +61,16 @@ def delayed_inputs(
     most = SMOOTH if smooth or way is not None else LINEAR if linear else HELD
     past, ahead = REACH[most]
     behind = lead + past  # rows near a row that have a share in it
-    before = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])  # before the record the first input was held
-    for _ in range(past):  # what is beyond both ends matters to the first and the last rows only
-        before = jnp.concatenate([beyond(before[::-1])[None], before, beyond(before)[None]])
-    near = before[jnp.arange(rows)[:, None] + jnp.arange(behind + 1 + ahead)[None]]
+
+    def nearby(u: Array) -> Array:
+        """Return the rows near every row; before the record the first input was held."""
+        before = jnp.concatenate([jnp.repeat(u[:1], lead, axis=0), u])
+        for _ in range(past):  # what is beyond both ends matters to the first and the last rows only
+            before = jnp.concatenate([beyond(before[::-1])[None], before, beyond(before)[None]])
+        return before[jnp.arange(rows)[:, None] + jnp.arange(behind + 1 + ahead)[None]]
+
+    near = nearby(u)
+    near_curve = nearby(begun_smoothly(u, lead, past)) if past else near
     order = jnp.arange(1, rows * substeps + 1, dtype=u.dtype)
     # how many rows the end of every substep lies behind each of the rows near it; whole numbers and fractions, no floor: two
     # compiled loops may round a quotient to two sides of a row, and read one sample with the weight of another
@@ -99,24 +106,31 @@ def delayed_inputs(
     def one_held(near: Array, d: Array, tau: Array) -> Array:
         return lagged(*line(HELD, near, back - d / dt), tau)[0]
 
-    def one_moving(word: str, near: Array, d: Array, tau: Array, way: Array | None) -> Array:
+    def one_moving(i: int, d: Array, tau: Array) -> Array:
         passed = back - d / dt
-        if way is None:
-            mean, rise = line(word, near, passed)
-        else:
-            parts = jnp.maximum(1 - 2 * way, 0.0), 1 - jnp.abs(2 * way - 1), jnp.maximum(2 * way - 1, 0.0)
-            each = [line(word, near, passed) for word in KERNELS]
-            mean, rise = (
-                sum((part * one[k] for part, one in zip(parts, each, strict=True)), jnp.zeros(())) for k in (0, 1)
-            )
-        mean, rise = lagged(mean, rise, tau)
-        return jnp.stack([mean + at * rise for at in STAGES])
+        parts = {SMOOTH if i in smooth else LINEAR: jnp.ones((), u.dtype)}
+        if way is not None:
+            w = 2 * way[i]
+            parts = {HELD: jnp.maximum(1 - w, 0.0), LINEAR: 1 - jnp.abs(w - 1), SMOOTH: jnp.maximum(w - 1, 0.0)}
+        rows_of = {word: (near_curve if word == SMOOTH else near)[..., i] for word in parts}
+        lines = {word: line(word, rows_of[word], passed) for word in parts}
+        found = [sum((parts[word] * lines[word][k] for word in parts), jnp.zeros(())) for k in (0, 1)]
+        mean, rise = lagged(found[0], found[1], tau)
+        stages = jnp.stack([mean + at * rise for at in STAGES])
+        if SMOOTH not in parts:
+            return stages
+        # a curve is no line: where it is at the stages, whose Simpson sum is its mean; what lags is a line nearly
+        at_stages = passed[:-1], (passed[:-1] + passed[1:]) / 2, passed[1:]
+        curve = [weighed(_complete(KERNELS[SMOOTH].values(t), 1.0), rows_of[SMOOTH]) for t in at_stages]
+        off = [c - (lines[SMOOTH][0] + at * lines[SMOOTH][1]) for c, at in zip(curve, STAGES, strict=True)]
+        prompt = 1 - jnp.exp(-dt / substeps / (tau + 1e-15 * dt / substeps))
+        return stages + parts[SMOOTH] * prompt * jnp.stack(off)
 
     if not linear:
         every = jax.vmap(one_held, in_axes=(2, 0, 0), out_axes=1)(near, delay, lag)
         return every.reshape(rows, substeps, 1, -1)[lead:]
     columns = [
-        one_moving(SMOOTH if i in smooth else LINEAR, near[..., i], delay[i], lag[i], way if way is None else way[i])
+        one_moving(i, delay[i], lag[i])
         if i in linear
         else jnp.broadcast_to(one_held(near[..., i], delay[i], lag[i]), (len(STAGES), rows * substeps))
         for i in range(u.shape[1])

@@ -14,6 +14,7 @@ from simpel_cli.inference.protocols import Method
 from simpel_cli.priors.function_prior import GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import Settings
 from simulators.model import Model
+from simulators.quantity import HELD
 
 
 class Declared(NamedTuple):
@@ -47,11 +48,11 @@ class Declared(NamedTuple):
                 data.latency_over(found.latency) if isinstance(data, Measurements) and data.latency else found.latency
             )
             return replace(found, between_rows=found.between_rows | said, latency=late, asked=self._columns_of_groups)
-        linear = [name for name, word in said.items() if word == "linear"]
-        if linear:
+        moving = [name for name, word in said.items() if word != HELD]
+        if moving:
             raise ConfigError(
-                f"data.between_rows.{linear[0]}: linear, but {found.name} is asked for single transitions, over which it holds "
-                "its inputs. Give held, or a simulator in symbols."
+                f"data.between_rows.{moving[0]}: {said[moving[0]]}, but {found.name} is asked for single transitions, over "
+                "which it holds its inputs. Give held, or a simulator in symbols."
             )
         return found
 

@@ -91,9 +91,10 @@ def _new_measurements(study: Study, own: dict[str, Any], job: Job, record: dict[
     for i, q in enumerate(study.system.encoding.inputs):
         ways = [i in linear, i in other.system.encoding.linear]
         if ways[0] != ways[1]:
-            was, is_ = ("linear" if way else "held" for way in ways)
+            was, is_ = ("that move" if way else "that are held" for way in ways)
             raise ConfigError(
-                f"data.between_rows.{q.name}: {is_}, but the run was fitted to inputs that are {was} between rows."
+                f"data.between_rows.{q.name}: inputs {is_}, but the run was fitted to inputs {was} between rows. "
+                f"Give {'linear or smooth' if ways[0] else 'held'}."
             )
     if other.system.encoding != study.system.encoding:
         raise ConfigError("data: these data have other measured quantities than the run was fitted to.")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search.acceptance import gated_selection
-from simpel_cli.discovery.search.gate.long_runs import harmless_in_long_runs
+from simpel_cli.discovery.search.acceptance import gated_selection, harmless
+from simpel_cli.discovery.search.gate.long_runs import gone_astray
 from simpel_cli.discovery.search.sets.forward import selected
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.uses import FREE_RUN, windows_for
@@ -56,33 +56,44 @@ def found() -> tuple[Recording, Search, Assessor, Trial]:
     return data, search, Assessor(plan, 10), search.add(search.base(), [slow]).trials[0]
 
 
+def turned(search: Search, chosen: Trial) -> Trial:
+    """Return the model with the strength of its effect the other way."""
+    z = chosen.optimum.z.copy()
+    (k,) = (i for i, q in enumerate(search.plan.augmented.params) if q.name.startswith("slow") and q.name.endswith("k"))
+    z[k] = 1 - z[k]
+    return Trial(chosen.terms, chosen.optimum._replace(z=z))
+
+
 @pytest.mark.parametrize("harm", [True, False])
-def test_what_goes_astray_over_whole_episodes_goes(
-    found: tuple[Recording, Search, Assessor, Trial], harm: bool
-) -> None:
+def test_what_goes_astray_over_long_runs_goes(found: tuple[Recording, Search, Assessor, Trial], harm: bool) -> None:
     data, search, assessor, chosen = found
     terminal = Terminal(quiet=True)
     selection = selected(search, search.base(), 0, (search.base(), chosen), settled=True)
     selection, gates, _ = gated_selection(search, assessor, selection, terminal)
     assert selection.chosen.terms == chosen.terms
-    if harm:  # as a start of every window's own may hide
-        z = selection.chosen.optimum.z.copy()
-        (k,) = (
-            i for i, q in enumerate(search.plan.augmented.params) if q.name.startswith("slow") and q.name.endswith("k")
-        )
-        z[k] = 1 - z[k]
-        worse = Trial(chosen.terms, selection.chosen.optimum._replace(z=z))
+    if harm:  # what a start of every window's own may hide
+        worse = turned(search, selection.chosen)
         selection = selection._replace(chosen=worse, path=(*selection.path[:-1], worse))
     runs = windows_for(search.plan, data, FREE_RUN)
-    after, left = harmless_in_long_runs(search, assessor, selection, gates, runs, terminal)
+    after, left = harmless(search, assessor, selection, gates, runs, terminal)
     assert (after.chosen.terms == ()) == (left == []) == (set(chosen.terms) <= search.banned) == harm
     search.banned -= set(chosen.terms)
 
 
+def test_for_a_use_both_models_are_calibrated_for_it(found: tuple[Recording, Search, Assessor, Trial]) -> None:
+    """Calibrated for free runs the strength comes back, and nothing grows."""
+    data, search, assessor, chosen = found
+    worse, runs = turned(search, chosen), windows_for(search.plan, data, FREE_RUN)
+    astray = gone_astray(search, assessor, worse, runs)
+    assert astray is not None
+    assert (astray.place, astray.channel) == (0, "x")
+    assert astray.times > 1.5
+    assert gone_astray(search, assessor, worse, runs, FREE_RUN) is None
+
+
 def test_windows_as_long_as_the_episodes_are_not_looked_at_again(
-    found: tuple[Recording, Search, Assessor, Trial],
+    found: tuple[Recording, Search, Assessor, Trial], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, search, assessor, chosen = found
-    selection = selected(search, search.base(), 0, (search.base(), chosen), settled=True)
-    same = harmless_in_long_runs(search, assessor, selection, [], search.plan.windows, Terminal(quiet=True))
-    assert same == (selection, [])
+    monkeypatch.setattr(Assessor, "free_runs", None)
+    assert gone_astray(search, assessor, turned(search, chosen), search.plan.windows) is None

@@ -38,7 +38,8 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
     ]
     kind = truth["kind"]
     if kind == "none":
-        return FALSE if claimed else UNEXPLAINED if found["verdict"] == "unexplained" else RIGHT
+        left = found["verdict"] == "unexplained" or found["remainder"]
+        return FALSE if claimed else UNEXPLAINED if left else RIGHT
     if kind == "outside":
         if claimed:
             return RIGHT if found["remainder"] else WRONG

@@ -301,6 +301,7 @@ DRAG = planted("drag", accept=["quadratic_drag", "viscous_friction"])
 OFFSET = claim("input_offset", on="u")
 EITHER = claim("constant_load", "input_offset") | {"class_acts_on": {"constant_load": "v", "input_offset": "u"}}
 LEFT = {"acts_on": "v", "depends_on": ["v"]}
+LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts_on": "v"}]}
 
 
 @pytest.mark.parametrize(
@@ -308,6 +309,8 @@ LEFT = {"acts_on": "v", "depends_on": ["v"]}
     [
         ("none", [], verdict(kind="none"), "right"),
         ("none", [], verdict(kind="unexplained"), "unexplained"),
+        ("none", [], verdict(LATE), "right"),  # a nuisance may be named
+        ("none", [], verdict(LATE, remainder=LEFT), "unexplained"),
         ("none", [], verdict(claim("coulomb_friction"), remainder=LEFT), "false effect"),
         ("one", [COULOMB], verdict(claim("coulomb_friction")), "right"),
         ("one", [COULOMB], verdict(claim("coulomb_friction", on="w")), "wrong"),
@@ -334,7 +337,8 @@ LEFT = {"acts_on": "v", "depends_on": ["v"]}
     ],
 )  # fmt: skip
 def test_outcomes(kind: str, effects: list[dict[str, Any]], found: dict[str, Any], expected: str) -> None:
-    assert score.outcome({"kind": kind, "effects": effects}, found) == expected
+    truth = {"kind": kind, "effects": effects, "may_be": [["sensor_delay", "v"]]}
+    assert score.outcome(truth, found) == expected
 
 
 @pytest.mark.parametrize(("more", "expected"), [(2.0, "tie"), (9.0, "wrong")])

@@ -1,12 +1,14 @@
 """A run with an input that is linear between rows: later verbs take it so, and what contradicts is said."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command_line import csv, rig, simpel, swing
 
 from simpel_cli.data import Measurements
 from simpel_cli.errors import ConfigError
+from simpel_cli.studies.declared import Declared
 
 FEW = ("method=sysid", "method.steps=3", "method.starts=2", "method.particles=3", "run.figures=false", "run.quiet=true")
 NAMES = ("s", "v", "u")
@@ -32,7 +34,8 @@ def test_other_data_are_taken_as_those_of_the_run(folder: Path) -> None:
 def test_what_contradicts_the_run_is_said(folder: Path) -> None:
     done = simpel(folder, "evaluate", "run", "--config-dir", "my", "data=later", "data.between_rows={u: held}")
     assert done.code == 2
-    assert "data.between_rows.u: held, but the run was fitted to inputs that are linear between rows" in done.err
+    said = "data.between_rows.u: inputs that are held, but the run was fitted to inputs that move between rows. Give linear"
+    assert said in done.err
 
 
 def test_rows_that_do_not_follow_each_other_have_no_next_value(folder: Path) -> None:
@@ -56,6 +59,15 @@ def test_rows_that_do_not_follow_each_other_have_no_next_value(folder: Path) -> 
 def test_wrong_keys_are_named(keys: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Measurements(path="run.csv", **keys)
+
+
+@pytest.mark.parametrize("word", ["linear", "smooth"])
+def test_a_black_box_holds_its_inputs(word: str) -> None:
+    declared = Declared(
+        {}, {"sim": SimpleNamespace(name="box"), "data": Measurements(path="run.csv", between_rows={"u": word})}
+    )
+    with pytest.raises(ConfigError, match=rf"data.between_rows.u: {word}, but box is asked for single transitions"):
+        _ = declared.source
 
 
 def test_a_state_is_no_input() -> None:

@@ -95,7 +95,7 @@ def test_is_better_than_without_them(node: dict[str, Any], place: str, size: flo
     corrected = node | {"parameters": {"b": size, "late": late}, "sensors": {place: of}}
     before, after = errors(node, seen, u, 2), errors(corrected, seen, u, 2)
     own = list(node["states"]).index(place)
-    # a line is exact; what is late is shown to second order
+    # a line is exact; what is late is shown to third order
     most = np.full(2, 1e-3 if kind in ("bias", "scale") else 0.3) * before[:, own]
     assert (after[:, own] < most).all(), (before, after)
     assert (after[:, 1 - own] <= 1.05 * before[:, 1 - own] + 1e-9).all(), (before, after)

@@ -10,6 +10,7 @@ from simpel_cli.discovery.search.again import Earlier, path_in, stages_in
 from simpel_cli.discovery.search.gate.few_places import in_few_places
 from simpel_cli.discovery.search.gate.harm import growing_for
 from simpel_cli.discovery.search.gate.held_out import Gate, gates, score
+from simpel_cli.discovery.search.gate.long_runs import gone_astray
 from simpel_cli.discovery.search.near import far
 from simpel_cli.discovery.search.sets.forward import condensed, further, selected, widely
 from simpel_cli.discovery.search.sets.rivals import rivalled
@@ -20,6 +21,7 @@ from simpel_cli.discovery.search.unexplained.interactions import interaction
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import ONE_STEP
 from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
 
@@ -117,6 +119,30 @@ def accepted(
         selection, found = after, gates_after
         if selection.chosen.terms == named.chosen.terms:
             return selection, found
+
+
+def harmless(
+    search: Search, assessor: Assessor, selection: Selection, found: list[Gate], runs: Windows, terminal: Terminal,
+    use: str | float = ONE_STEP,
+) -> tuple[Selection, list[Gate]]:  # fmt: skip
+    """Return what is left without effects with which free runs of training rows surely grow, the worst first.
+
+    Args:
+        search: over sets of effects.
+        assessor: of errors ahead.
+        selection: what was accepted.
+        found: its gates.
+        runs: windows of training rows, long ones.
+        terminal: takes lines.
+        use: as of `judgement`.
+    """
+    while (astray := gone_astray(search, assessor, selection.chosen, runs, use)) is not None:
+        gone = selection.chosen.terms[astray.place]
+        label, times = search.terms[gone].label, f"{astray.times:.3g} times"
+        terminal.line(f"{label}: the error of long free runs of {astray.channel} grows {times}: not accepted", "gate")
+        search.banned.add(gone)
+        selection, found, _ = gated_selection(search, assessor, refused(search, selection, astray.place), terminal, use)
+    return selection, found
 
 
 def gated_selection(

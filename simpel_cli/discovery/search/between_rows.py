@@ -19,7 +19,7 @@ from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of, questions
 from simulators.effects.term import BETWEEN_ROWS
 from simulators.model import Model
-from simulators.quantity import LINEAR, SMOOTH
+from simulators.quantity import HELD, LINEAR, SMOOTH
 
 MOVES = {LINEAR: "goes straight from a row to the next", SMOOTH: "is a smooth curve from row to row"}
 AGAINST = {LINEAR: "held or smooth", SMOOTH: "held or linear"}
@@ -78,9 +78,10 @@ def preferences(search: Search, at: Trial) -> dict[str, Preference]:
     rows = {t: search.rows[t][0] for t in names}
     best = {t: min(WAY, key=lambda word: abs(WAY[word] - search.plan.start[rows[t]])) for t in names}
     asked = [(t,) for t in names] + ([tuple(names)] if len(names) > 1 else [])
-    evidence = {tuple(best.values()): at.optimum.log_evidence}
+    evidence = {tuple(best.values()): float(np.nan_to_num(at.optimum.log_evidence, nan=-np.inf))}
+    choices = [LINEAR, HELD] if search.plan.clocked else [*WAY]  # a curve goes by whole rows
     while True:
-        others = [best | dict.fromkeys(own, word) for own in asked for word in WAY]
+        others = [best | dict.fromkeys(own, word) for own in asked for word in choices]
         said = [words for words in others if tuple(words.values()) not in evidence]
         fits = search.fitter([_said(search, at, words, rows) for words in said]) if said else []
         for words, fit in zip(said, fits, strict=True):
@@ -89,7 +90,7 @@ def preferences(search: Search, at: Trial) -> dict[str, Preference]:
         if after == best:
             break
         best = after
-    alone = {t: {word: evidence[tuple((best | {t: word}).values())] for word in WAY} for t in names}
+    alone = {t: {word: evidence[tuple((best | {t: word}).values())] for word in choices} for t in names}
     return {names[t]: Preference(best[t], _ahead(alone[t], best[t])) for t in names}
 
 

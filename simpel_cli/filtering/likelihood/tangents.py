@@ -11,8 +11,9 @@ parameter, for which the Jacobian F of a row follows to second order in dt. A la
 moves, as the innovations form of a prediction-error method does.
 
 Of what a late sensor reads, the slope A of the rates is held, and with it the rest of the third order: up to a tenth of a
-derivative (`tests/filtering/test_tangents.py`). That does not bias a fit: what is left at the true parameters is noise,
-whatever it is weighed with, as with instruments in place of slopes (Ljung 1999, ch. 7.6).
+derivative (`tests/filtering/test_tangents.py`). That does not bias the fit of a model that is right: what is left at its true
+parameters is noise, whatever it is weighed with, as with instruments in place of slopes (Ljung 1999, ch. 7.6). Of a model that
+lacks something the optimum moves a little.
 
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised); Ljung
 (1999), System identification, ch. 7.

@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Array
 
 from simpel_cli.data.recording import Episode
+from simpel_cli.dynamics.between_rows import beyond
 from simpel_cli.errors import DataError
 
 LEAST = 3  # rows of a window: a start, and one that it predicts, and one that confirms it
 LONGEST = 256  # rows of a window: a longer record is cut, and its windows run side by side
 LEAST_EPISODES = 3  # to hold out whole ones
+PARABOLA = 2  # rows behind an episode that go on as its inputs did
 UNEVEN = 0.01  # of a step: a clock that strays less is taken for even
 ROUNDED = 3  # different steps of an even clock with rounded stamps; one more than two, since floating point rounds, too
 LONGEST_RUN = 2048  # of a window along which free runs are calibrated
@@ -147,8 +149,10 @@ def windows_of(
             counts = np.where(ok, weight[begin : begin + length], 0.0)
             rows["ok"].append(np.pad(counts, ((0, missing), (0, 0))))
             rows["y"].append(np.pad(np.where(ok, part, 0.0), ((0, missing), (0, 0))))
-            u = past[begin : begin + lead + len(part)]
-            rows["u"].append(np.pad(np.nan_to_num(u), ((0, missing), (0, 0)), mode="edge"))
+            u = np.nan_to_num(past[begin : begin + lead + len(part)])
+            for _ in range(min(missing, PARABOLA)):  # what a smooth input reads there; within what it was
+                u = np.concatenate([u, np.clip(beyond(u), u.min(axis=0), u.max(axis=0))[None]])
+            rows["u"].append(np.pad(u, ((0, max(missing - PARABOLA, 0)), (0, 0)), mode="edge"))
             start = np.array(centre, float)
             for j, name in enumerate(measured):
                 if name in states and ok[0, j]:

@@ -1,73 +1,82 @@
-"""Whether an effect does harm over whole episodes, which a search sees in short windows only.
+"""Whether an effect does harm in free runs that are longer than the windows of a search.
 
 A search cuts long episodes into windows, and every window begins with a state of its own. An effect that only makes up for
-where a window begins, as one with a slow hidden state, helps in every window, held out or not, and goes astray in a free run of
-the whole. So the free runs of the training episodes, from what their first rows tell, are looked at with and without it. Both
-models are fitted to the same rows, and the larger one has more freedom: an error that surely grows all the same is harm.
+where a window begins, as one with a slow hidden state, helps in every window, held out or not, and goes astray in a long run.
+So free runs of the training episodes, from what their first rows tell, are looked at with and without it. An error that surely
+grows, in rows that both models were fitted to, is harm. Where a use is named, it has to grow with both models calibrated for
+that, too: parameters that predict the next row best need not simulate best (`harm.py`).
 """
 
 from functools import partial
+from typing import NamedTuple
 
-import numpy as np
-
-from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, growing
-from simpel_cli.discovery.search.sets.selection import Selection, refused
+from simpel_cli.discovery.search.gate.held_out import AHEAD, growing
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for
+from simpel_cli.filtering.errors_ahead import Assessor, rmse, with_lost
 from simpel_cli.filtering.independent_parts import independent_parts
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.measurements.windows import Windows
-from simpel_cli.runs.console import Terminal
+from simpel_cli.filtering.tracks import Tracks
 
 
-def harmless_in_long_runs(
-    search: Search, assessor: Assessor, selection: Selection, judged: list[Gate], windows: Windows, terminal: Terminal
-) -> tuple[Selection, list[Gate]]:
-    """Return the selection without effects with which free runs of whole training episodes surely grow, the worst first.
+class Astray(NamedTuple):
+    """An effect with which a free run goes astray.
 
     Args:
-        search: over sets of effects.
-        assessor: of errors ahead.
-        selection: what was accepted.
-        judged: its gates.
-        windows: training episodes, each as long as it is; no longer than those of the search: nothing new is in them.
-        terminal: takes lines.
+        place: of it, among the terms of the model.
+        channel: whose error grows most.
+        times: how often it is as large as without the effect.
+    """
+
+    place: int
+    channel: str
+    times: float
+
+
+def gone_astray(
+    search: Search, assessor: Assessor, chosen: Trial, windows: Windows, use: str | float = ONE_STEP
+) -> Astray | None:
+    """Return the effect with which a free run of training rows surely grows most; None: there is none.
+
+    Args:
+        search: that the model comes from.
+        assessor: of its program.
+        chosen: the model.
+        windows: of training rows; no longer than those of the search: nothing new is in them.
+        use: what the model will be calibrated for.
     """
     if windows.y.shape[1] <= search.plan.windows.y.shape[1]:
-        return selection, judged
-    while selection.chosen.terms:
-        chosen = selection.chosen
-        parts = [search.part(chosen, tuple(t for t in chosen.terms if t != gone)) for gone in chosen.terms]
-        question = "long runs", chosen.terms, *(trial.optimum.z.tobytes() for trial in (chosen, *parts))
-        grows = search.once(question, partial(_growing, assessor, chosen, parts, windows))
-        gone = max(range(len(grows)), key=lambda i: grows[i][0])
-        times, which = grows[gone]
-        if not which:
-            break
-        label = search.terms[chosen.terms[gone]].label
-        terminal.line(
-            f"{label}: over whole episodes the error of {which[0]} grows {times:.3g} times: not accepted", "gate"
-        )
-        search.banned.add(chosen.terms[gone])
-        selection = refused(search, selection, gone)
-        judged = [gate for i, gate in enumerate(judged) if i != gone] if selection.chosen.terms else []
-    return selection, judged
+        return None
+    found = []
+    for i, gone in enumerate(chosen.terms):
+        part = search.part(chosen, tuple(t for t in chosen.terms if t != gone))
+        question = "long runs", use, chosen.terms, gone, chosen.optimum.z.tobytes(), part.optimum.z.tobytes()
+        grows = search.once(question, partial(_grows, search, assessor, chosen, part, windows, use))
+        found += [] if grows is None else [Astray(i, *grows)]
+    return max(found, key=lambda astray: astray.times, default=None)
 
 
-def _growing(
-    assessor: Assessor, whole: Trial, parts: list[Trial], windows: Windows
-) -> list[tuple[float, tuple[str, ...]]]:
-    """Return, for every effect, how often the error is as large with it as without, where it surely grows, and which it is."""
-    first = assessor.first_of(windows)
-    starts = [begun(assessor, trial.optimum.z, windows, first) for trial in (whole, *parts)]
-    with_all, *others = (
-        assessor.free_runs(trial.optimum.z[None], start)[0]
-        for trial, start in zip((whole, *parts), starts, strict=True)
+def _grows(
+    search: Search, assessor: Assessor, whole: Trial, part: Trial, windows: Windows, use: str | float
+) -> tuple[str, float] | None:
+    """Return the channel whose error grows most for certain from a part to the whole, and how often it is as large."""
+    found = _growing(assessor, whole, part, windows)
+    if found is None or use == ONE_STEP:
+        return found
+    seen = windows if use == FREE_RUN else search.plan.windows
+    whole, part = (calibrated_for(search, assessor, trial, seen, use) for trial in (whole, part))
+    return _growing(assessor, whole, part, windows)
+
+
+def _growing(assessor: Assessor, whole: Trial, part: Trial, windows: Windows) -> tuple[str, float] | None:
+    first, tracks, free = assessor.first_of(windows), Tracks(assessor.plan), AHEAD["free"]
+    without, with_it = (
+        assessor.free_runs(t.optimum.z[None], begun(tracks, t.optimum.z, windows, first))[0] for t in (part, whole)
     )
-    free, found = AHEAD["free"], []
-    for errors in others:
-        cut = independent_parts(errors, with_all, windows.episode)
-        which = growing({free: cut.before}, {free: cut.after}, assessor.plan.augmented.measured, cut.parts)
-        ratio = np.sqrt(np.nansum(with_all**2, axis=(0, 1)) / np.maximum(np.nansum(errors**2, axis=(0, 1)), 1e-300))
-        found.append((float(ratio.max()) if which else 0.0, which))
-    return found
+    cut = independent_parts(without, with_it, windows.episode)
+    names = assessor.plan.augmented.measured
+    which = growing({free: cut.before}, {free: cut.after}, names, cut.parts)
+    before, after = (rmse(errors) for errors in with_lost(without, with_it))
+    times = {name: float(after[j] / before[j]) for j, name in enumerate(names) if f"{name} {free}" in which}
+    return max(times.items(), key=lambda item: item[1], default=None)

@@ -61,10 +61,10 @@ def interaction(
     search, assessor, chosen = levels.search, levels.assessor, levels.chosen
     model = search.plan.augmented.model
     slots = sum(len(column) for column in slots_of(model))  # which group a row is of is no argument
-    if len(model.states) + len(model.inputs) - slots > MOST_ARGUMENTS:
+    brought = {store.name for t in search.terms for store in t.stores}  # a state that is a guess itself is no argument
+    if len(model.states) - len(brought) + len(model.inputs) - slots > MOST_ARGUMENTS:
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
-    brought = {store.name for t in search.terms for store in t.stores}  # a state that is a guess itself is no argument
     every = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
     terms = [t for t in every if not brought & {t.acts_on, *t.depends_on}]
     going = _worth_a_fit(promised(levels, terms), terms, known + ACCEPT)
