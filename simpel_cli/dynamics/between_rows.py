@@ -85,6 +85,8 @@ REACH = {
 def begun_smoothly(u: Float[Array, "R nu"], lead: int, rows: int) -> Float[Array, "R nu"]:
     """Return inputs whose record begins behind so many rows that repeat its first value, with a parabola in the last of these.
 
+    It stays within what the input was: a delay reads it, too.
+
     Args:
         u: inputs; the first `lead` rows are the past.
         lead: rows of the past; they are known, and stay, where one of them is another value.
@@ -93,7 +95,7 @@ def begun_smoothly(u: Float[Array, "R nu"], lead: int, rows: int) -> Float[Array
     still = jnp.all(u[:lead] == u[lead][None], axis=0)
     record = u[lead:]
     for k in range(min(rows, lead)):
-        before = beyond(record[::-1])
+        before = jnp.clip(beyond(record[::-1]), jnp.min(record, axis=0), jnp.max(record, axis=0))
         record = jnp.concatenate([before[None], record])
         u = u.at[lead - 1 - k].set(jnp.where(still, before, u[lead - 1 - k]))
     return u

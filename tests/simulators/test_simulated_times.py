@@ -13,6 +13,7 @@ from test_simulate import decay, late_model, static, world_of
 from simulators.model import Declared, Model, ModelError
 from simulators.worlds.callable_world import CallableWorld
 from simulators.worlds.groups import Group, Spread
+from simulators.worlds.motion import Inputs
 from simulators.worlds.simulate import Simulate, Simulation
 from simulators.worlds.timing import Clock
 
@@ -327,3 +328,22 @@ def test_rows_without_time_have_no_late_inputs(late: dict[str, float]) -> None:
     ).model()  # fmt: skip
     with pytest.raises(ModelError, match=rf"sim.inputs.u.{next(iter(late))}: line has no states"):
         Simulate(episodes=1, steps=5).run(model)
+
+
+@pytest.mark.parametrize("stray", [0.0, 0.3])
+def test_smooth_inputs_pass_through_their_rows_and_follow_a_cubic(stray: float) -> None:
+    """Slopes through five rows are exact of polynomials up to the fourth degree; beside them others stay what they are."""
+    random = np.random.default_rng(0)
+    times = (np.arange(12.0) + stray * random.uniform(-0.5, 0.5, 12))[None]
+    cubic = 0.01 * (times - 4) ** 3 - 0.2 * times
+    values = np.stack([cubic, cubic, cubic], axis=2)
+    given = Inputs.of_rows(times, values, ("smooth", "linear", "held"))
+    np.testing.assert_allclose(given.at(times, 1e-9), values, atol=1e-9)
+    within = np.linspace(times[0, 2], times[0, -3], 400)[
+        None
+    ]  # nearer to the ends a parabola stands for what is beyond
+    found = given.at(within, 1e-9)[0]
+    np.testing.assert_allclose(found[:, 0], 0.01 * (within[0] - 4) ** 3 - 0.2 * within[0], atol=1e-3)
+    np.testing.assert_allclose(found[:, 1], np.interp(within[0], times[0], cubic[0]), atol=1e-9)
+    assert set(np.round(found[:, 2], 9)) <= set(np.round(cubic[0], 9))
+    assert given.linear.tolist() == [True, True, False]
