@@ -89,6 +89,7 @@ def test_for_a_use_both_models_are_calibrated_for_it(found: tuple[Recording, Sea
     assert (astray.place, astray.channel) == (0, "x")
     assert astray.times > 1.5
     assert gone_astray(search, assessor, worse, runs, FREE_RUN) is None
+    assert gone_astray(search, assessor, worse, runs, 2.0) is None  # windows are longer than that
 
 
 def test_windows_as_long_as_the_episodes_are_not_looked_at_again(

@@ -3,8 +3,9 @@
 A search cuts long episodes into windows, and every window begins with a state of its own. An effect that only makes up for
 where a window begins, as one with a slow hidden state, helps in every window, held out or not, and goes astray in a long run.
 So free runs of the training episodes, from what their first rows tell, are looked at with and without it. An error that surely
-grows, in rows that both models were fitted to, is harm. Where a use is named, it has to grow with both models calibrated for
-that, too: parameters that predict the next row best need not simulate best (`harm.py`).
+grows, in rows that both models were fitted to, is harm. Where the use is a free run, it has to grow with both models calibrated
+for that, too: parameters that predict the next row best need not simulate best (`harm.py`). Where it is some seconds, which
+windows hold, it is not asked: of a position that is added up over minutes a free run tells little.
 """
 
 from functools import partial
@@ -46,7 +47,7 @@ def gone_astray(
         windows: of training rows; no longer than those of the search: nothing new is in them.
         use: what the model will be calibrated for.
     """
-    if windows.y.shape[1] <= search.plan.windows.y.shape[1]:
+    if windows.y.shape[1] <= search.plan.windows.y.shape[1] or not isinstance(use, str):
         return None
     found = []
     for i, gone in enumerate(chosen.terms):
@@ -64,8 +65,7 @@ def _grows(
     found = _growing(assessor, whole, part, windows)
     if found is None or use == ONE_STEP:
         return found
-    seen = windows if use == FREE_RUN else search.plan.windows
-    whole, part = (calibrated_for(search, assessor, trial, seen, use) for trial in (whole, part))
+    whole, part = (calibrated_for(search, assessor, trial, windows, FREE_RUN) for trial in (whole, part))
     return _growing(assessor, whole, part, windows)
 
 
