@@ -10,13 +10,15 @@ Reference: Keys (1981), Cubic convolution interpolation for digital image proces
 cubics, of which this one has slopes of fourth order in the distance of rows; the parabola beyond both ends).
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from simulators.quantity import HELD, LINEAR, SMOOTH
 
+Rows = TypeVar("Rows", Array, np.ndarray)
 WAY = {HELD: 0.0, LINEAR: 0.5, SMOOTH: 1.0}  # from held over linear to smooth, where it is asked
 
 
@@ -101,8 +103,8 @@ def begun_smoothly(u: Float[Array, "R nu"], lead: int, rows: int) -> Float[Array
     return u
 
 
-def beyond(u: Float[Array, "rows *nu"]) -> Float[Array, " *nu"]:
-    """Return the value behind the last, as a parabola through the last three has it; of fewer the last."""
+def beyond(u: Rows) -> Rows:
+    """Return the value (...) behind the last of (rows, ...), as a parabola through the last three has it; of fewer the last."""
     return 3 * u[-1] - 3 * u[-2] + u[-3] if len(u) > 2 else u[-1]
 
 

@@ -94,7 +94,7 @@ def test_a_policy_says_how_its_commands_are_applied() -> None:
 def test_a_truth_that_holds_what_the_simulator_does_not_is_refused() -> None:
     encoding = encoding_of(rotor())
     with pytest.raises(
-        ConfigError, match=r"u of rotor is held between rows; that of sim is linear. Say the same of both"
+        ConfigError, match=r"u of rotor is held between rows; that of sim is linear or smooth. Say the same"
     ):
         check_compatible("truth", rotor(u="held"), encoding, TASK.bind(encoding), 0.1)
 
