@@ -8,12 +8,15 @@ from simpel_cli.discovery.search.acceptance import gated_selection, harmless
 from simpel_cli.discovery.search.gate.long_runs import gone_astray
 from simpel_cli.discovery.search.sets.forward import selected
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained import interactions
+from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.discovery.search.unexplained.pair_screening import Promise
 from simpel_cli.discovery.search.uses import FREE_RUN, windows_for
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup, with_memory
 from simpel_cli.runs.console import Terminal
-from simulators.effects import Expression
+from simulators.effects import Expression, Term
 from simulators.model import Declared
 
 DT, TRAIN, ROWS, NOISE, MEMORY = 0.1, 4000, 4500, 0.01, 2.0
@@ -98,3 +101,19 @@ def test_windows_as_long_as_the_episodes_are_not_looked_at_again(
     _, search, assessor, chosen = found
     monkeypatch.setattr(Assessor, "free_runs", None)
     assert gone_astray(search, assessor, turned(search, chosen), search.plan.windows) is None
+
+
+def test_a_state_that_an_effect_brought_is_no_argument_of_a_function(
+    found: tuple[Recording, Search, Assessor, Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, search, assessor, chosen = found
+    asked: list[Term] = []
+
+    def promised(levels: NoiseProfile, terms: list[Term]) -> list[Promise]:
+        asked.extend(terms)
+        return []
+
+    monkeypatch.setattr(interactions, "promised", promised)
+    monkeypatch.setattr(interactions, "_worth_a_fit", lambda *_: [])
+    assert interactions.interaction(NoiseProfile(search, assessor, chosen), setup, 2) is None
+    assert {(t.acts_on, t.depends_on) for t in asked} == {("x", ("x", "u"))}
