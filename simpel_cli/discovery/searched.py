@@ -312,7 +312,7 @@ def _with(
     while True:
         judged = selection.chosen.terms
         selection, gates = accepted(found.search, assessor, selection, gates, terminal, options.for_ or ONE_STEP)
-        if selection.chosen.terms and not ground.budget.over("free runs of whole episodes"):
+        if selection.chosen.terms and not ground.budget.over("long free runs"):
             runs = windows_for(found.search.plan, ground.clean.recording, FREE_RUN)
             use = options.for_ or ONE_STEP
             selection, gates = harmless(found.search, assessor, selection, gates, runs, terminal, use)

@@ -91,7 +91,7 @@ def test_late_and_lagging_sensors_are_right_to_third_order(late: float, lag: flo
     inputs = jnp.full((plan.lead + ROWS, 1), u)
     deaf, still_there = Noise(jnp.full(2, 1e6), jnp.zeros(2)), (jnp.array([0.0, v_0]), jnp.full(2, 1e-9))
     errors = []
-    for t in (0.16, 0.08):
+    for t in (0.16, 0.08, 0.02):
         p = p_of_plan(plan, A, B)
         p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late * t, lag * t
         rows = jnp.zeros((ROWS, 2))
@@ -100,6 +100,7 @@ def test_late_and_lagging_sensors_are_right_to_third_order(late: float, lag: flo
         motion = np.exp(-A * (np.arange(2, ROWS) * DT - late * t)) / (1 - A * lag * t)
         errors.append(np.abs(read - (end + (v_0 - end) * motion)).max())
     assert errors[0] < 2e-3
+    assert errors[2] < 1e-6
     assert 9 < errors[0] / errors[1] < 20  # fourth order in the time
 
 
