@@ -96,10 +96,11 @@ def begun_smoothly(u: Float[Array, "R nu"], lead: int, rows: int) -> Float[Array
     """
     still = jnp.all(u[:lead] == u[lead][None], axis=0)
     record = u[lead:]
+    low, high = jnp.min(record, axis=0), jnp.max(record, axis=0)
     for k in range(min(rows, lead)):
-        before = jnp.clip(beyond(record[::-1]), jnp.min(record, axis=0), jnp.max(record, axis=0))
+        before = beyond(record[::-1])
         record = jnp.concatenate([before[None], record])
-        u = u.at[lead - 1 - k].set(jnp.where(still, before, u[lead - 1 - k]))
+        u = u.at[lead - 1 - k].set(jnp.where(still, jnp.clip(before, low, high), u[lead - 1 - k]))
     return u
 
 

@@ -150,8 +150,10 @@ def windows_of(
             rows["ok"].append(np.pad(counts, ((0, missing), (0, 0))))
             rows["y"].append(np.pad(np.where(ok, part, 0.0), ((0, missing), (0, 0))))
             u = np.nan_to_num(past[begin : begin + lead + len(part)])
+            low, high = u.min(axis=0), u.max(axis=0)
             for _ in range(min(missing, PARABOLA)):  # what a smooth input reads there; within what it was
-                u = np.concatenate([u, np.clip(beyond(u), u.min(axis=0), u.max(axis=0))[None]])
+                u = np.concatenate([u, beyond(u)[None]])
+            u = np.clip(u, low, high)
             rows["u"].append(np.pad(u, ((0, max(missing - PARABOLA, 0)), (0, 0)), mode="edge"))
             start = np.array(centre, float)
             for j, name in enumerate(measured):
