@@ -93,7 +93,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
             ground = ground._replace(
                 model=model,
-                wider=ground.wider + 1,
+                wider=ground.wider + found.times,
                 earlier=found.earlier or (ground.earlier and ground.earlier._replace(settled=False)),
                 simulated=found.simulated or ground.simulated,
                 remembering=tuple(terms),
@@ -256,8 +256,9 @@ def _with(
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
 
     def wider(search: Search, trial: Trial) -> Wider | None:
-        late = ground.wider == MOST_WIDER or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
-        return None if late else too_narrow(search, trial)
+        left = MOST_WIDER - ground.wider
+        late = not left or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
+        return None if late else too_narrow(search, trial, left)
 
     def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
         chosen = selection.chosen

@@ -92,6 +92,17 @@ def test_a_parameter_outside_its_range_is_found_there(b: float, end: int) -> Non
     assert again.optimum.log_evidence < chosen.optimum.log_evidence - 100
 
 
+def test_a_range_that_is_far_too_narrow_widens_until_the_fit_is_inside() -> None:
+    search = searched(measured(7.0))
+    base = search.base()
+    found = too_narrow(search, base)
+    assert found is not None
+    low, high = found.ranges["b"]
+    assert (low, found.times) == (0.8, 2)  # to 3.8, to 9.8
+    assert 7.0 < high < 10.0
+    assert too_narrow(search, base, 1) is None  # once wider is not enough to be the simpler cause
+
+
 def test_a_range_that_holds_the_truth_stays() -> None:
     search = searched(measured(1.2))
     chosen = search.base()

@@ -35,18 +35,23 @@ class Wider(NamedTuple):
     Args:
         ranges: by the names of their parameters.
         gain: nats of evidence.
+        times: that ranges became wider.
         earlier: what was chosen without them.
         simulated: likewise by simulations, where these ask for them.
     """
 
     ranges: dict[str, Range]
     gain: float
+    times: int = 1
     earlier: Earlier | None = None
     simulated: Earlier | None = None
 
 
-def too_narrow(search: Search, trial: Trial) -> Wider | None:
+def too_narrow(search: Search, trial: Trial, most: int = MOST_WIDER) -> Wider | None:
     """Return the wider ranges with which a model gains; None: there are none.
+
+    A fit that stands at the end of a wider range, too, asks at once for the next one, `most` times in all, not in a search of
+    its own.
 
     The simulator alone has to gain with them nearly what it gains with the best effect, or the rest of a model what an effect
     adds to it: that may only make up for them, and that a range is too narrow is the simpler cause.
@@ -55,27 +60,35 @@ def too_narrow(search: Search, trial: Trial) -> Wider | None:
         wider = _wider(search.plan, trial)
         trials = search.add(trial, search.candidates(())).trials if wider else ()
         best = trials[0].optimum.log_evidence - trial.optimum.log_evidence if trials else 0.0
-        return _paying(search, trial, NEARLY_ALL * best - TIE)
-    if (found := _paying(search, trial, 0.0)) is not None:
+        return _paying(search, trial, NEARLY_ALL * best - TIE, most)
+    if (found := _paying(search, trial, 0.0, most)) is not None:
         return found
     for gone in trial.terms:
         rest = search.part(trial, tuple(t for t in trial.terms if t != gone))
         earned = trial.optimum.log_evidence - rest.optimum.log_evidence
-        if (found := _paying(search, rest, NEARLY_ALL * earned - TIE)) is not None:
+        if (found := _paying(search, rest, NEARLY_ALL * earned - TIE, most)) is not None:
             return found
     return None
 
 
-def _paying(search: Search, trial: Trial, least: float) -> Wider | None:
+def _paying(search: Search, trial: Trial, least: float, most: int) -> Wider | None:
     """Return the wider ranges with which a model gains so many nats, and what they have to earn; None: it does not."""
-    wider = _wider(search.plan, trial)
-    if not wider:
-        return None
-    gain = _best(search, trial, wider) - trial.optimum.log_evidence
-    names = [q.name for q in search.plan.augmented.params]
-    if not gain > max(least, ACCEPT * len(wider)):
-        return None
-    return Wider({names[row]: ends for row, ends in wider.items()}, float(gain))
+    plan, wide, found = search.plan, search.plan, None
+    names, before, ranges = [q.name for q in plan.augmented.params], trial, dict[int, Range]()
+    for times in range(1, most + 1):
+        if not (wider := _wider(wide, before)):
+            break
+        wide, z = _ranged(wide, before.optimum.z, wider)
+        after = Trial(trial.terms, max(_fitted(search, trial, wide, z), key=lambda o: o.log_evidence))
+        gain = after.optimum.log_evidence - before.optimum.log_evidence
+        if not gain > ACCEPT * len(wider):
+            break
+        ranges |= wider
+        gain = after.optimum.log_evidence - trial.optimum.log_evidence
+        if gain > least:
+            found = Wider({names[row]: ends for row, ends in ranges.items()}, float(gain), times)
+        before = after
+    return found
 
 
 def widened(model: Model, effects: Sequence[Expression], ranges: Mapping[str, Range]) -> tuple[Model, list[Expression]]:
@@ -168,11 +181,6 @@ def _ranged(plan: Setup, z: np.ndarray, ranges: Mapping[int, Range]) -> tuple[Se
     for row in ranges:
         start[row], at[row] = (coordinates.unit(row, plan.coordinates.value(row, float(v[row]))) for v in (start, z))
     return plan._replace(coordinates=coordinates, start=start, optimum=None), at
-
-
-def _best(search: Search, trial: Trial, ranges: Mapping[int, Range]) -> float:
-    """Return the evidence of a model with other ranges."""
-    return max(o.log_evidence for o in _fitted(search, trial, *_ranged(search.plan, trial.optimum.z, ranges)))
 
 
 def _fitted(search: Search, trial: Trial, plan: Setup, z: np.ndarray) -> list[Optimum]:
