@@ -9,7 +9,7 @@ from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
 from simpel_cli.discovery.last_calibration import last_calibration
 from simpel_cli.discovery.search.acceptance import accepted, harmless, judgement, proposed, with_interactions
-from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_in
+from simpel_cli.discovery.search.again import Again, AllRows, Earlier, asked_again, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
@@ -36,6 +36,8 @@ from simpel_cli.filtering.setup import MOST_GROUPED, Setup, key_of, members, ter
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression
+
+First = Wider | Finer | AllRows  # what a search has to know, or be made in, before anything is judged
 
 
 class Searched(NamedTuple):
@@ -93,6 +95,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
             ground = ground._replace(
                 model=model,
+                rows=ground.few,
                 wider=ground.wider + found.times,
                 earlier=found.earlier or (ground.earlier and ground.earlier._replace(settled=False)),
                 simulated=found.simulated or ground.simulated,
@@ -102,6 +105,9 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terminal.line(f"these effects ask for {found.steps} integration steps a row: searching once more", "steps")
             options = replace(ground.options, substeps=found.steps)
             ground = ground._replace(options=options, earlier=found.earlier, finer=True)
+        elif isinstance(found, AllRows):
+            terminal.line(f"going on from there in about {ground.options.rows} rows", "data")
+            ground = ground._replace(rows=ground.options.rows, earlier=found.earlier)
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
@@ -111,7 +117,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
     return found._replace(**last._asdict())
 
 
-def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | Wider | Finer | Again:
+def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | First | Again:
     """Search; once more with the effects that differ from group to group, as long as that pays.
 
     A state that nobody measures may stand for what differs from group to group, which is the simpler cause: it is asked last.
@@ -126,9 +132,7 @@ def _search_in_groups(ground: Ground, effects: list[Expression]) -> Searched | W
     return found.again._replace(effects=effects)
 
 
-def _settled_in_groups(
-    ground: Ground, effects: list[Expression]
-) -> tuple[Searched | Wider | Finer | Again, list[Expression]]:
+def _settled_in_groups(ground: Ground, effects: list[Expression]) -> tuple[Searched | First | Again, list[Expression]]:
     """Do so; also returns the effects as they were searched for in the end."""
     found = _search(ground, effects)
     for _ in range(MOST_GROUPED):
@@ -153,7 +157,7 @@ def _settled_in_groups(
 
 def _search(
     ground: Ground, effects: list[Expression], settled: list[Grouping] | None = None
-) -> Searched | Wider | Finer | Again:
+) -> Searched | First | Again:
     """Calibrate the simulator, choose effects, and accept those that help on held-out episodes.
 
     Args:
@@ -169,7 +173,7 @@ def _search(
             terminal.line(grouping_in_words(one), "groups")
     while True:
         found = _with(ground, effects, own, ask=settled is None)
-        if isinstance(found, Searched | Wider | Finer | Again):
+        if isinstance(found, Searched | First | Again):
             return found
         own, earlier = found
         settled, ground = own, ground._replace(earlier=earlier)
@@ -188,15 +192,18 @@ class _Heavy(NamedTuple):
 def _chosen_in(
     found: Calibrated, assessor: Assessor, ground: Ground, unsound: Callable[[Search, Selection], Wider | Finer | None],
     earlier: Earlier | None = None,
-) -> tuple[Calibrated, Selection, list[Gate]] | Wider | Finer:  # fmt: skip
+) -> tuple[Calibrated, Selection, list[Gate]] | First:  # fmt: skip
     """Search and judge; nothing is judged on held-out episodes in ranges too narrow, steps too coarse, or the wrong noise."""
     options = ground.options
 
-    def wrong(selection: Selection) -> Wider | Finer | _Heavy | None:
+    def wrong(selection: Selection) -> First | _Heavy | None:
         if (first := unsound(found.search, selection)) is not None:
             return _told(first, found, selection)
         heavy = None if beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
-        return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
+        if heavy is not None:
+            return _Heavy(heavy, chosen_of(found, selection))
+        few = ground.rows < options.rows and not ground.budget.over("the rest of the rows")
+        return AllRows(chosen_of(found, selection)._replace(settled=True)) if few else None
 
     if earlier is not None and earlier.heavy:
         path = path_in(found.search, found.base, earlier)
@@ -204,7 +211,7 @@ def _chosen_in(
     while True:
         selection = proposed(found.search, assessor, found.base, options, earlier=earlier)
         outcome = judgement(found.search, assessor, selection, ground.terminal, options.for_ or ONE_STEP, wrong)
-        if isinstance(outcome, Wider | Finer):
+        if isinstance(outcome, First):
             return outcome
         if not isinstance(outcome, _Heavy):
             return found, *outcome
@@ -237,7 +244,7 @@ def chosen_of(found: Calibrated | Searched, selection: Selection) -> Earlier:
 
 def _with(
     ground: Ground, effects: list[Expression], own: list[Grouping], *, ask: bool
-) -> Searched | Wider | Finer | Again | tuple[list[Grouping], Earlier]:
+) -> Searched | First | Again | tuple[list[Grouping], Earlier]:
     """Search with the parameters of the simulator that differ from group to group.
 
     Args:
@@ -291,7 +298,7 @@ def _with(
         promising = remembering(at_base := NoiseProfile(found.search, assessor, found.base), at_base)
         return Again(promising[0], None) if promising and promising[0].gain > ends.gain - TIE else ends
     outcome = _chosen_in(found, assessor, ground, unsound, ground.earlier)
-    if isinstance(outcome, Wider | Finer):
+    if isinstance(outcome, First):
         return outcome
     found, selection, gates = outcome
     said, chosen = words_of(between_rows), selection.chosen
@@ -302,7 +309,7 @@ def _with(
         plan, earlier = attach(saying(model, between_rows), kept=kept), chosen_of(found, selection)
         assessor, found = begun_in(plan)
         outcome = _chosen_in(found, assessor, ground, unsound, earlier)
-        if isinstance(outcome, Wider | Finer):
+        if isinstance(outcome, First):
             return outcome
         found, selection, gates = outcome
     if ask and own and selection.chosen.terms and not ground.budget.over("parameters per group, beside the effects"):
@@ -323,7 +330,7 @@ def _with(
         if heavy is None:
             break
         outcome = _chosen_in(heavy, assessor, ground, unsound, chosen_of(found, selection))
-        if isinstance(outcome, Wider | Finer):
+        if isinstance(outcome, First):
             return outcome
         found, selection, gates = outcome
     search, windows = found.search, found.test
