@@ -26,7 +26,7 @@ ERRORS = {h: {"omega": v} for h, v in (("one_step", 0.05), ("horizon", 0.4), ("f
 AFTER = {h: {"omega": v} for h, v in (("one_step", 0.03), ("horizon", 0.04), ("free_run", 0.06))}
 EFFECT: dict[str, Any] = {
     "name": "coulomb_friction", "acts_on": "omega", "meaning": "dry friction, the same at every speed",
-    "class": ["coulomb_friction"], "class_acts_on": {"coulomb_friction": "omega"}, "same_as": [],
+    "class": ["coulomb_friction"], "class_acts_on": {"coulomb_friction": "omega"}, "same_as": [], "same_as_two": [],
     "class_members": [{"name": "coulomb_friction", "acts_on": "omega", "same": True}],
     "log_evidence_gain": 193.04, "share_of_residual": 0.98,
     "held_out_gain": {"gain": 31.0, "low": 24.0, "high": 38.0, "unit": "episode", "passed": True},

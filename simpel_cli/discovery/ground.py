@@ -12,7 +12,7 @@ from simpel_cli.discovery.watch import Watch
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned
 from simpel_cli.filtering.measurements.windows import LONGEST
-from simpel_cli.filtering.setup import Setup, key_of, setup
+from simpel_cli.filtering.setup import Key, Setup, key_of, setup
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
@@ -40,6 +40,7 @@ class Ground(NamedTuple):
         earlier: what was chosen before something else was known.
         simulated: likewise by simulations.
         remembering: effects with a state of their own that the program has room for.
+        places: terms that an earlier search had a place for.
         finer: whether a search asked for the integration steps of `options`, not the user.
     """
 
@@ -56,6 +57,7 @@ class Ground(NamedTuple):
     earlier: Earlier | None = None
     simulated: Earlier | None = None
     remembering: tuple[Term, ...] = ()
+    places: frozenset[Key] = frozenset()
     finer: bool = False
 
     def attach(self, effects: list[Expression]) -> Callable[..., Setup]:

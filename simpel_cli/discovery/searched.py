@@ -88,6 +88,8 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
     declared, terminal = ground.model, ground.terminal
     found = _search_in_groups(ground, effects)
     while not isinstance(found, Searched):
+        if isinstance(found, First) and found.earlier:
+            ground = ground._replace(places=frozenset(map(key_of, found.earlier.search.terms)))
         if isinstance(found, Wider):
             terminal.line(ranges_in_words(found), "ranges")
             model, effects = widened(ground.model, effects, found.ranges)
@@ -260,7 +262,7 @@ def _with(
     declared = ground.model
     model = with_own(declared, per_of(own)) if per_of(own) else declared
     terms = terms_of(model, ground.clean.recording, effects, pairs=options.pairs)
-    plan, kept, between_rows = prepared(attach, model, terms, options, terminal)
+    plan, kept, between_rows = prepared(attach, model, terms, options, terminal, ground.places)
 
     def wider(search: Search, trial: Trial) -> Wider | None:
         left = MOST_WIDER - ground.wider

@@ -64,7 +64,7 @@ def rivals(folder: Path, truth: Mapping[str, Any], tuned: Mapping[str, Sequence[
 
 def graded(truth: Mapping[str, Any], chosen: list[tuple[str, str]]) -> str:
     """Grade an answer as the tool's are; a twin counts as right, since a rival has no means to say so."""
-    effects = [{"name": e, "acts_on": p, "class": [e], "same_as": []} for e, p in chosen]
+    effects = [{"name": e, "acts_on": p, "class": [e], "same_as": [], "same_as_two": []} for e, p in chosen]
     found = {"verdict": "effect" if effects else "none", "effects": effects, "remainder": None}
     result = score.outcome(truth, found)
     return score.RIGHT if result == score.TWIN else result

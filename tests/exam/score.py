@@ -1,7 +1,8 @@
 """What an answer is worth: the outcome of one set, from its truth and the tool's verdict.
 
-right: the name, or only such as no data of this system can tell from it; tie: several names of which one is right; twin: only
-a name that no data can tell from the planted one; part: one of two; wrong: a name that is not there; nothing, unexplained.
+right: the name, or only such as no data of this system can tell from it; tie: several names of which one is right, or one name
+of which it is said that these data cannot tell it from the two that are planted; twin: only a name that no data can tell from
+the planted one; part: one of two; wrong: a name that is not there; nothing, unexplained.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,12 +52,28 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
     for effect in claimed:
         judged = [(_grade(effect, planted[i], gains or {}), i) for i in range(len(planted))]
         judged = [(g, i) for g, i in judged if g in ORDER and (i in open_ or kind == "shape")]
+        if len(open_) == len(planted) == 2 and not judged and _said_to_be(effect, planted):
+            grades.append(TIE)
+            open_ = []
+            continue
         if not judged:
             return HEDGED if kind == "shape" and found["remainder"] else WRONG
         grade, i = min(judged, key=lambda pair: ORDER.index(pair[0]))
         grades.append(grade)
         open_ = [j for j in open_ if j != i]
     return PART if open_ else max(grades, key=ORDER.index)
+
+
+def _said_to_be(effect: Mapping[str, Any], planted: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether it is said of an effect that these data cannot tell it from the two that are planted."""
+    same = [
+        {(n, p["acts_on"]) for n in p["accept"]} | {tuple(t.split("@")) for t in p["twins"]} for p in planted
+    ]  # fmt: skip
+    return any(
+        (first["name"], first["acts_on"]) in same[i] and (second["name"], second["acts_on"]) in same[1 - i]
+        for first, second in effect.get("same_as_two", ())
+        for i in (0, 1)
+    )
 
 
 def _grade(effect: Mapping[str, Any], planted: Mapping[str, Any], gains: Gains) -> str:

@@ -300,6 +300,8 @@ LOAD = planted("constant_load", twins=["input_offset@u"])
 DRAG = planted("drag", accept=["quadratic_drag", "viscous_friction"])
 OFFSET = claim("input_offset", on="u")
 EITHER = claim("constant_load", "input_offset") | {"class_acts_on": {"constant_load": "v", "input_offset": "u"}}
+ASYMMETRIC = claim("asymmetric_friction")
+PAIR = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "input_offset", "acts_on": "u"}]
 LEFT = {"acts_on": "v", "depends_on": ["v"]}
 LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts_on": "v"}]}
 
@@ -325,6 +327,12 @@ LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts
         ("one", [planted("gravity_tilt")], verdict(claim("sensor_bias", on="phi", same_as=("gravity_tilt",))), "right"),
         ("two", [COULOMB, DELAY], verdict(claim("input_delay", on="u"), claim("coulomb_friction")), "right"),
         ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction")), "part"),
+        ("two", [COULOMB, LOAD], verdict(ASYMMETRIC), "wrong"),
+        ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "tie"),
+        ("two", [LOAD, COULOMB], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "tie"),
+        ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}, claim("leak")), "wrong"),
+        ("two", [COULOMB, DELAY], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
+        ("one", [COULOMB], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
         ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("leak")), "wrong"),
         ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("input_delay", "input_lag", on="u")), "tie"),
         ("shape", [DRAG], verdict(claim("quadratic_drag"), claim("viscous_friction")), "right"),

@@ -42,8 +42,9 @@ class Prepared(NamedTuple):
 
 
 def prepared(
-    attach: Callable[..., Setup], model: Model, terms: Sequence[Term], options: Discovery, terminal: Terminal
-) -> Prepared:
+    attach: Callable[..., Setup], model: Model, terms: Sequence[Term], options: Discovery, terminal: Terminal,
+    known: frozenset[Key] = frozenset(),
+) -> Prepared:  # fmt: skip
     """Calibrate the simulator alone, where that tells what the whole program needs: what inputs do, which terms to try.
 
     Args:
@@ -52,6 +53,8 @@ def prepared(
         terms: all of them.
         options: of the search.
         terminal: takes lines that say what goes on.
+        known: terms that an earlier search had a place for, in other ranges, rows or steps. Those of a large model have one
+            again: others would be compiled anew.
     """
     unknowns = sum(len(t.parameters) for t in terms)
     unsaid, many = questions(model), unknowns > MOST_PARAMETERS
@@ -75,9 +78,11 @@ def prepared(
     if found:
         terminal.line(in_words(found), "inputs")
     if many:
-        forces = Forces(plan.rule, plan.coordinates, model.dt)
-        force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
-        kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
+        kept = known & frozenset(map(key_of, terms))
+        if not kept:
+            forces = Forces(plan.rule, plan.coordinates, model.dt)
+            force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
+            kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
         left = sum(len(t.parameters) for t in terms if key_of(t) in kept)
         terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
     whole = attach(saying(model, found), kept=kept)

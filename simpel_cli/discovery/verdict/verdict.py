@@ -9,6 +9,7 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
+from simpel_cli.discovery.search.sets.splitting import two_in_place
 from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
@@ -180,6 +181,10 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         "class_acts_on": places,
         "class_members": members,
         "same_as": list(dict.fromkeys([*term.same_as, *same])),
+        "same_as_two": [
+            [{"name": t.effect, "acts_on": t.acts_on} for t in pair]
+            for pair in two_in_place(search, selection.chosen, i)
+        ],
         "log_evidence_gain": selection.gains[i],
         "held_out_gain": None if gate is None else gate._asdict(),
         "parameters": {
@@ -300,4 +305,9 @@ def _phrase(effect: dict[str, Any]) -> str:
     )
     aliases = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
     also = f", in this model the same as {' and '.join(aliases)}" if aliases else ""
-    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}"
+    pairs = [
+        " with ".join(f"{m['name'].replace('_', ' ')} on {m['acts_on']}" for m in pair)
+        for pair in effect["same_as_two"]
+    ]
+    two = f", to these data no other than {' or '.join(pairs)}" if pairs else ""
+    return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}{two}"

@@ -1,0 +1,60 @@
+"""One effect that holds another, and the two that fit as well in its place."""
+
+import numpy as np
+import pytest
+from test_ranges import cart
+
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.sets.splitting import two_in_place
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.setup import setup
+from simulators.effects import Expression
+
+WIDTH = {"range": [0.05, 3], "neutral": 0.1, "unit": "m/s", "starts": [0.1, 1]}
+SIZE = {"range": [0, 3], "unit": "m/s^2", "starts": [0.3]}
+COULOMB = Expression("coulomb", acts_on="v", term="-c*tanh(v/w)", parameters={"c": SIZE, "w": WIDTH})
+ASYMMETRIC = Expression(
+    "asymmetric", acts_on="v", term="-p*max(tanh(v/w), 0) + n*max(-tanh(v/w), 0)",
+    parameters={"p": SIZE, "n": SIZE, "w": WIDTH}, generalises=("coulomb",),
+)  # fmt: skip
+LOAD = Expression("load", acts_on="v", term="a", parameters={"a": {"range": [-2, 2], "unit": "m/s^2", "starts": [0.2]}})
+SPRING = Expression(
+    "spring", acts_on="v", term="-k*s", parameters={"k": {"range": [-1, 1], "unit": "1/s^2", "starts": [0.1]}}
+)
+
+
+def rubbing(noise: float, width: float = 0.05) -> Recording:
+    """Carts whose friction is 1.2 m/s^2 forwards and 0.4 backwards, beyond a speed of `width`, m/s; noise: in m and m/s."""
+    random, fine = np.random.default_rng(4), 50
+    episodes = []
+    for e in range(4):
+        u = np.repeat(random.uniform(-3, 3, 12), 5)
+        s, v, rows = 0.0, 0.0, []
+        for now in u:
+            rows.append((s, v))
+            for _ in range(fine):
+                t = np.tanh(v / width)
+                s, v = s + 0.1 / fine * v, v + 0.1 / fine * (1.2 * now - (1.2 if t > 0 else 0.4) * t)
+        noisy = np.array(rows) + noise * random.normal(size=(60, 2))
+        episodes.append(Episode(str(e), np.arange(60) * 0.1, noisy, u[:, None], np.zeros((60, 0))))
+    every = {"s": noise, "v": noise}
+    return Recording(tuple(episodes[:3]), tuple(episodes[3:]), (), every, (), (Check("c", True, ""),), ())
+
+
+@pytest.mark.parametrize(("noise", "same"), [(0.05, True), (1e-3, False)])
+def test_friction_that_differs_is_coulombs_and_a_load_unless_low_speeds_are_seen(noise: float, same: bool) -> None:
+    plan = setup(cart(), rubbing(noise), (), [ASYMMETRIC, COULOMB, LOAD, SPRING], 4)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=13))
+    place = {term.effect: t for t, term in enumerate(search.terms)}
+    base = search.base()
+    chosen = search.add(base, [place["asymmetric"]]).trials[0]
+    assert chosen.optimum.log_evidence - base.optimum.log_evidence > 50
+    pairs = two_in_place(search, chosen, 0)
+    assert [[t.effect for t in pair] for pair in pairs] == ([["coulomb", "load"]] if same else [])
+    coulomb = search.add(base, [place["coulomb"]]).trials[0]
+    assert two_in_place(search, coulomb, 0) == []  # it holds no other
+    search.budget = Budget(1.0, iter([0.0, 2.0]).__next__)
+    assert two_in_place(search, chosen, 0) == []
+    assert search.budget.left_out == ["two effects in place of one"]
