@@ -11,16 +11,12 @@ from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.watch import Watch
 from simpel_cli.dynamics.transition import encoding_of
 from simpel_cli.filtering.measurements.cleaning import Cleaned, cleaned
-from simpel_cli.filtering.measurements.windows import LONGEST
 from simpel_cli.filtering.setup import Key, Setup, key_of, setup
 from simpel_cli.inference.noise_scale import noise_scale_of
 from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression, Term
 from simulators.model import Model
-
-LARGE = 4  # states; a search with fewer takes no longer than compiling it once more for other rows
-FEW = 3  # times fewer rows, in which a search of a large model begins
 
 
 class Ground(NamedTuple):
@@ -34,8 +30,6 @@ class Ground(NamedTuple):
         terminal: takes lines.
         budget: time that it may take.
         watch: is told of fits.
-        few: training rows that a search begins in; as many as `discovery.rows`: in all that it looks at.
-        rows: that it looks at now.
         wider: how often ranges of the model or of effects were found too narrow.
         earlier: what was chosen before something else was known.
         simulated: likewise by simulations.
@@ -51,8 +45,6 @@ class Ground(NamedTuple):
     terminal: Terminal
     budget: Budget
     watch: Watch
-    few: int
-    rows: int
     wider: int = 0
     earlier: Earlier | None = None
     simulated: Earlier | None = None
@@ -64,7 +56,7 @@ class Ground(NamedTuple):
         """Return the function of a simulator that sets a search with these effects up."""
         attached = partial(
             setup, recording=self.clean.recording, declared_noise=self.declared_noise, effects=effects,
-            substeps=self.options.substeps, pairs=self.options.pairs, most_rows=self.rows,
+            substeps=self.options.substeps, pairs=self.options.pairs, most_rows=self.options.rows,
         )  # fmt: skip
 
         def with_memory(model: Model, *, extra: Sequence[Term] = (), **more: Any) -> Setup:
@@ -107,23 +99,5 @@ def ground_of(study: Study, effects: int, terminal: Terminal) -> Ground:
     rows = sum(len(e.time) for e in clean.recording.train)
     if rows > options.rows:
         terminal.line(f"searching in about {options.rows} of {rows} training rows (discovery.rows)", "data")
-    budget, few = Budget(seconds_of(options.budget)), few_rows(model, clean.recording, options.rows)
-    if few < options.rows:
-        terminal.line(f"beginning in about {few} of them: {len(model.states)} states", "data")
-    return Ground(model, clean, options, declared_noise, terminal, budget, Watch(budget), few, few)
-
-
-def few_rows(model: Model, recording: Recording, most: int) -> int:
-    """Return the training rows that a search begins in.
-
-    Which effects there are, in which ranges and noise, is asked many times, and takes long with many states. A part of the rows
-    tells most of it; what is left to be asked in all is what stands beside what they told, and what they were too few for.
-
-    Args:
-        model: the simulator.
-        recording: clean measurements.
-        most: rows that a search looks at.
-    """
-    rows, episodes = min(most, sum(len(e.time) for e in recording.train)), len(recording.train)
-    few = max(rows // FEW, episodes * LONGEST)  # one window of every episode in any case
-    return few if len(model.states) >= LARGE and not model.groups and few <= rows // 2 else most
+    budget = Budget(seconds_of(options.budget))
+    return Ground(model, clean, options, declared_noise, terminal, budget, Watch(budget))

@@ -9,7 +9,7 @@ from simpel_cli.data import Recording
 from simpel_cli.discovery.ground import Ground, ground_of
 from simpel_cli.discovery.last_calibration import last_calibration
 from simpel_cli.discovery.search.acceptance import accepted, harmless, judgement, proposed, with_interactions
-from simpel_cli.discovery.search.again import Again, AllRows, Earlier, asked_again, path_in
+from simpel_cli.discovery.search.again import Again, Earlier, asked_again, path_in
 from simpel_cli.discovery.search.between_rows import Preference, asked_beside, in_words, saying, words_of
 from simpel_cli.discovery.search.by_group.grouping import Grouping, confirmed, grouped_effects, groupings
 from simpel_cli.discovery.search.by_group.grouping import in_words as grouping_in_words
@@ -37,7 +37,7 @@ from simpel_cli.runs.console import Terminal
 from simpel_cli.studies.open import Study
 from simulators.effects import Expression
 
-First = Wider | Finer | AllRows  # what a search has to know, or be made in, before anything is judged
+First = Wider | Finer  # what has to be known before anything is judged
 
 
 class Searched(NamedTuple):
@@ -97,7 +97,6 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
             ground = ground._replace(
                 model=model,
-                rows=ground.few,
                 wider=ground.wider + found.times,
                 earlier=found.earlier or (ground.earlier and ground.earlier._replace(settled=False)),
                 simulated=found.simulated or ground.simulated,
@@ -107,9 +106,6 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terminal.line(f"these effects ask for {found.steps} integration steps a row: searching once more", "steps")
             options = replace(ground.options, substeps=found.steps)
             ground = ground._replace(options=options, earlier=found.earlier, finer=True)
-        elif isinstance(found, AllRows):
-            terminal.line(f"going on from there in about {ground.options.rows} rows", "data")
-            ground = ground._replace(rows=ground.options.rows, earlier=found.earlier)
         else:
             terminal.line(found.memory.words, "memory")
             ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
@@ -202,10 +198,7 @@ def _chosen_in(
         if (first := unsound(found.search, selection)) is not None:
             return _told(first, found, selection)
         heavy = None if beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
-        if heavy is not None:
-            return _Heavy(heavy, chosen_of(found, selection))
-        few = ground.rows < options.rows and not ground.budget.over("the rest of the rows")
-        return AllRows(chosen_of(found, selection)._replace(settled=True)) if few else None
+        return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
 
     if earlier is not None and earlier.heavy:
         path = path_in(found.search, found.base, earlier)

@@ -100,7 +100,7 @@ def test_a_state_that_nobody_measures_is_asked_when_groups_are_known(
     monkeypatch.setattr(whole, "confirmed", lambda groupings, *_: groupings)
     monkeypatch.setattr(whole, "chosen_of", lambda *_: None)
     terminal: Any = SimpleNamespace(line=lambda *_: None)
-    ground = Ground(nothing, nothing, nothing, (), terminal, Budget(), Watch(Budget()), 3000, 3000)
+    ground = Ground(nothing, nothing, nothing, (), terminal, Budget(), Watch(Budget()))
     found = whole._search_in_groups(ground, [drag])
     if pays:
         assert isinstance(found, Searched)

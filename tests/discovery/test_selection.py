@@ -15,7 +15,7 @@ from simpel_cli.data.recording import Recording
 from simpel_cli.discovery import searched as searched_module
 from simpel_cli.discovery.search import acceptance, calibration
 from simpel_cli.discovery.search.acceptance import MOST_SEARCHES, accepted, gated_selection, judgement, proposed
-from simpel_cli.discovery.search.again import AllRows, Earlier, path_in
+from simpel_cli.discovery.search.again import Earlier, path_in
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.calibration import Calibrated, calibrated
 from simpel_cli.discovery.search.gate.held_out import Gate
@@ -729,7 +729,7 @@ def test_noise_that_was_heavy_is_so_from_the_beginning_of_the_next_search(monkey
     monkeypatch.setattr(acceptance, "gated_selection", lambda *_: (kept, [], []))
     monkeypatch.setattr(searched_module, "with_heavy_tails", tails)
     none: Any = None
-    ground: Any = SimpleNamespace(rows=9, options=SimpleNamespace(for_=None, rows=9), terminal=None, budget=Budget())
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None, budget=Budget())
     unchecked(monkeypatch)
     monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
     monkeypatch.setattr(searched_module, "_with_tails", unwrap(searched_module._with_tails))
@@ -796,44 +796,13 @@ def test_ranges_and_steps_are_asked_before_anything_is_judged_and_after_somethin
     monkeypatch.setattr(searched_module, "_heavy", unwrap(searched_module._heavy))
     none: Any = None
     found = Calibrated(none, none, none, none, {"y": 3.0})
-    ground: Any = SimpleNamespace(rows=9, options=SimpleNamespace(for_=None, rows=9), terminal=None)
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
     outcome = unwrap(_chosen_in)(found, none, ground, ends)
     chosen = proposal.chosen if asks == "proposed" else judged.chosen
     earlier = Earlier(none, chosen, heavy=True, settled=isinstance(first, Finer))  # in finer steps the same is asked
     assert outcome == (first._replace(earlier=earlier) if asks else (found, judged, []))
     assert asked_of == questions
     assert judgements == ([] if asks == "proposed" else [proposal])
-
-
-@pytest.mark.parametrize(("shown_by", "seconds"), [("proposed", None), ("nothing", None), ("nothing", 1.0)])
-def test_few_rows_judge_nothing_and_hand_what_they_chose_to_all(
-    shown_by: str, seconds: float | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The noise is known first; where the time is over, what few rows chose is judged as it is."""
-    gaussian, heavy = in_noise("gaussian", {}), in_noise("heavy", {"y": 3.0})
-    proposals = {"gaussian": chosen_so("proposed", 2), "heavy": chosen_so("in heavy tails", 1)}
-    monkeypatch.setattr(searched_module, "proposed", lambda search, *_, **__: proposals[search.name])
-    monkeypatch.setattr(acceptance, "condensed", lambda _, selection: selection)
-    monkeypatch.setattr(acceptance, "gated_selection", lambda _, __, selection, *___: (selection, [], []))
-    unchecked(monkeypatch)
-
-    def tails(found: Any, _: Any, selection: Any, __: Any) -> Any:
-        return heavy if found is gaussian and selection.chosen.optimum == shown_by else None
-
-    monkeypatch.setattr(searched_module, "_heavy", tails)
-    clock = iter([0.0, *[2.0] * 9])
-    budget = Budget(seconds, lambda: next(clock))
-    options = SimpleNamespace(for_=None, rows=9)
-    ground: Any = SimpleNamespace(rows=3, options=options, terminal=None, budget=budget)
-    none: Any = None
-    outcome = unwrap(_chosen_in)(gaussian, none, ground, lambda *_: None)
-    last = heavy if shown_by == "proposed" else gaussian
-    chosen = proposals[last.search.name]
-    if seconds is None:
-        assert outcome == AllRows(Earlier(last.search, chosen.chosen, heavy=last is heavy, settled=True))
-    else:
-        assert outcome == (gaussian, chosen, [])
-        assert budget.left_out == ["the rest of the rows"]
 
 
 @pytest.mark.parametrize("shown_by", ["proposed", "judged"])
@@ -863,7 +832,7 @@ def test_what_is_judged_last_has_the_noise_that_its_own_residuals_show(
     monkeypatch.setattr(acceptance, "gated_selection", judge)
     monkeypatch.setattr(searched_module, "_heavy", tails)
     none: Any = None
-    ground: Any = SimpleNamespace(rows=9, options=SimpleNamespace(for_=None, rows=9), terminal=None)
+    ground: Any = SimpleNamespace(options=SimpleNamespace(for_=None), terminal=None)
     unchecked(monkeypatch)
     outcome = unwrap(_chosen_in)(gaussian, none, ground, lambda *_: None)
     assert outcome == (heavy, kept, [])

@@ -131,9 +131,7 @@ def test_out_of_time_models_are_calibrated_for_their_use_without_asking_other_ep
         return suited(search, assessor, trial, *given)
 
     monkeypatch.setattr(last, "suited", asking)
-    ground = Ground(
-        cart(), Cleaned(recording, (), {}), Discovery(for_=FREE_RUN), (), terminal, budget, Watch(budget), 3000, 3000
-    )
+    ground = Ground(cart(), Cleaned(recording, (), {}), Discovery(for_=FREE_RUN), (), terminal, budget, Watch(budget))
     found = last.last_calibration(
         ground, cart(), search, Selection(base, base, (base,), (), (), (), None), Assessor(search.plan, 10), {}
     )
@@ -155,7 +153,7 @@ def test_a_range_that_is_wider_for_what_is_left_unexplained_alone_is_no_finding(
     base, budget = search.base(), Budget(None)
     remainder = None if left is None else (search.terms[0], left)
     selection = Selection(base, base, (base,), (), (), (), remainder)
-    ground = Ground(cart(), Cleaned(recording, (), {}), Discovery(), (), terminal, budget, Watch(budget), 3000, 3000)
+    ground = Ground(cart(), Cleaned(recording, (), {}), Discovery(), (), terminal, budget, Watch(budget))
     found = last.last_calibration(ground, cart(), search, selection, Assessor(search.plan, 10), {})
     row = [q.name for q in search.plan.augmented.params].index("b")
     before, after = (

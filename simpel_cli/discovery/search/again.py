@@ -103,16 +103,6 @@ def beside(earlier: Earlier, attach: Callable[..., Setup], new: Sequence[Term], 
     return earlier._replace(search=small, chosen=best, settled=True, stages=())
 
 
-class AllRows(NamedTuple):
-    """A search that was made in few rows of a long record, and is worth making in all.
-
-    Args:
-        earlier: what was chosen in few.
-    """
-
-    earlier: Earlier
-
-
 class Again(NamedTuple):
     """Effects with a state of their own, with which a search is worth making again.
 
