@@ -152,6 +152,7 @@ class Table:
         self.search: Any = searched("b", [force(name) for name in "ABCDE"])
         self.search.fitter = self
         self.evidence = {frozenset(names): value for names, value in evidence.items()}
+        self.slopes = dict[str, float]()  # of names whose promise is another
         self.search.banned |= {i for i, term in enumerate(self.search.terms) if term.depends_on}
 
     def name(self, term: int) -> str:
@@ -169,6 +170,8 @@ class Table:
             value = float(self.of(frozenset(self.name(i) for i in on)))
             d, eye = len(hypothesis.free), np.eye(len(hypothesis.free))
             slope = np.full(d, 1000.0)  # everything promises the same, and enough to be fitted
+            for i in on:
+                slope[hypothesis.free.index(self.search.rows[i][0])] *= self.slopes.get(self.name(i), 1.0)
             found.append(
                 Optimum(hypothesis.z, hypothesis.free, -value, value, slope, 1e3 * eye, np.full(d, 0.5), eye, 1, True)
             )
@@ -874,6 +877,17 @@ def test_a_path_that_stays_behind_the_best_one_goes_no_further() -> None:
     assert len(forward._grow(table.search, start).path[-1].terms) == 5
     start = leader[0], table.search.part(leader[0], table.terms("D"))
     assert set(forward._grow(table.search, start, leader=leader).path[-1].terms) == set(table.terms("AD"))
+
+
+@pytest.mark.parametrize(("promise", "ends"), [({"E": 1.5}, 3), ({"E": 1.5, "C": 1.4}, 4), ({"C": 1.5}, 4), ({}, 4)])
+def test_a_path_that_follows_the_best_one_goes_no_further(promise: dict[str, float], ends: int) -> None:
+    """With D and A it has a part of what the best one has: it goes on only where something else promises about as much."""
+    table = Table({"": 0.0, "A": 30.0, "AD": 60.0, "ADE": 90.0, "ACD": 95.0, "D": 40.0})
+    leader = tuple(table.search.part(table.search.base(), table.terms(names)) for names in ("", "A", "AE", "AED"))
+    assert [t.optimum.log_evidence for t in leader] == [0.0, 30.0, 29.0, 90.0]
+    table.slopes = promise
+    start = leader[0], table.search.part(leader[0], table.terms("D"))
+    assert len(forward._grow(table.search, start, leader=leader).path) == ends
 
 
 def test_a_search_that_is_made_again_begins_with_what_the_last_one_chose() -> None:

@@ -13,7 +13,7 @@ from simpel_cli.discovery.search.sets.merging import merged
 from simpel_cli.discovery.search.sets.pairs import together
 from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, nameless, path_of, worth
-from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, TIE, Search, Stage, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, NEARLY_THE_BEST, TIE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects import Term
 
@@ -166,7 +166,8 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
         search: over sets of effects.
         path: to begin with.
         widely: the first one, and one at the end, may begin anywhere in its ranges.
-        leader: the best path so far: one that falls behind it, or comes to the same effects, goes no further.
+        leader: the best path so far: one that falls behind it, or comes to the same effects, goes no further; nor does one that
+            has come to a part of them, where what promises most beside these is the leader's, too.
     """
     stages: list[Stage] = []
     wide, behind = widely, 0
@@ -209,8 +210,20 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
             there = leader[len(best.terms)]
             behind = behind + 1 if worth(best) < worth(there) else 0
             alike = set(best.terms) == set(there.terms) and worth(best) <= worth(there) + ASTRAY
-            if behind == MOST_BEHIND or alike:
+            if behind == MOST_BEHIND or alike or _follows(search, best, leader[-1]):
                 return _Grown(path, tuple(stages), None)
+
+
+def _follows(search: Search, trial: Trial, leading: Trial) -> bool:
+    """Whether a model has a part of another one's effects, the rest of which promise far more beside it than what it lacks."""
+    ahead = set(leading.terms)
+    if not set(trial.terms) < ahead:
+        return False
+    starts = search.starts(trial, [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on])
+    own, others = 0.0, 0.0
+    for (t, _), score in zip(starts, search.promises(trial, starts), strict=True):
+        own, others = (max(own, score.sure), others) if t in ahead else (own, max(others, score.sure))
+    return others < NEARLY_THE_BEST * own
 
 
 def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:
