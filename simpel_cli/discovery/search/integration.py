@@ -113,10 +113,10 @@ def _moved(
         steps: that it is cut into.
     """
     h, now = row / steps, x.T
-    inputs, values = u.T, np.tile(p[:, None], len(x))
+    inputs, everywhere = u.T, augmented.function.map("everywhere", "serial", len(x), [2], [])  # one p for all points
 
     def rate(at: np.ndarray) -> np.ndarray:
-        return np.asarray(augmented.function(at, inputs, values)[0])
+        return np.asarray(everywhere(at, inputs, p)[0])
 
     with np.errstate(invalid="ignore", over="ignore"):
         for _ in range(steps):
