@@ -77,6 +77,15 @@ def test_every_input_is_what_it_was_planted_as(truth: dict[str, str]) -> None:
     assert "by" in in_words(found)
 
 
+def test_a_curve_is_not_offered_where_rows_follow_a_clock() -> None:
+    """It goes by whole rows; with the same input at an even clock it is found."""
+    data, random = recording(0, u="smooth"), np.random.default_rng(1)
+    late = tuple(e._replace(time=e.time + random.uniform(-0.02, 0.02, len(e.time))) for e in data.train)
+    found, search = asked(rotor(), data._replace(train=late))
+    assert search.plan.clocked
+    assert {name: p.word for name, p in found.items()} == {"u": "linear", "v": "held"}
+
+
 @pytest.mark.parametrize(
     ("line", "curve", "word"),
     [(400.0, 403.0, "linear"), (400.0, 430.0, "smooth"), (1.0, 30.0, "smooth"), (1.0, 2.0, "held")],
