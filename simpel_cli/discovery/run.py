@@ -20,6 +20,7 @@ from simpel_cli.discovery.search.by_group.grouping import sentence_of as of_grou
 from simpel_cli.discovery.search.by_group.own_parameters import declared_in, per_of, said_of_groups, written
 from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.heavy_tails import sentence_of as sentence_of_tails
+from simpel_cli.discovery.search.sets.splitting import two_in_place
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.searched import Searched, search_of
 from simpel_cli.discovery.verdict.beyond import Beyond, beyond, ranges_of
@@ -129,9 +130,12 @@ def _verdict(
     search, assessor, selection, gates, disturbance, windows, recording, between_rows, nu, asked, *_ = searched
     learnt = assessor(selection.chosen.optimum.z, search.plan.windows)
     left = remainder_of(search, selection, disturbance, learnt, searched.drift)
+    # what simulations have chosen is not judged row by row
+    places = range(0 if searched.by_simulations else len(selection.chosen.terms))
+    pairs = [two_in_place(search, selection.chosen, i) for i in places]
     seconds = time.perf_counter() - began
     found = verdict_of(
-        search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds
+        search, selection, gates, before, after, left, windows, recording.checks, assessor.horizon, seconds, pairs
     )
     found["between_rows"] = {name: p._asdict() for name, p in between_rows.items()}
     found["degrees_of_freedom"] = nu

@@ -58,6 +58,7 @@ class Searched(NamedTuple):
         wider: nats by which the evidence of the chosen model is ahead of that within the ranges that were declared.
         again: a search that is worth making once what differs from group to group is known; None: there is none.
         for_use: calibrates a model of the search for what it will be used for.
+        by_simulations: whether a search by simulations has chosen.
     """
 
     search: Search
@@ -74,6 +75,7 @@ class Searched(NamedTuple):
     drift: Drift | None = None
     again: Again | None = None
     for_use: Callable[[Trial], Trial] = lambda trial: trial
+    by_simulations: bool = False
 
 
 def search_of(study: Study, terminal: Terminal) -> Searched:
@@ -97,7 +99,7 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             terms = [t for t in with_memory(model, ground.clean.recording, effects) if key_of(t) in known]
             ground = ground._replace(
                 model=model,
-                wider=ground.wider + found.times,
+                wider=ground.wider + 1,
                 earlier=found.earlier or (ground.earlier and ground.earlier._replace(settled=False)),
                 simulated=found.simulated or ground.simulated,
                 remembering=tuple(terms),
@@ -258,9 +260,8 @@ def _with(
     plan, kept, between_rows = prepared(attach, model, terms, options, terminal, ground.places)
 
     def wider(search: Search, trial: Trial) -> Wider | None:
-        left = MOST_WIDER - ground.wider
-        late = not left or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
-        return None if late else too_narrow(search, trial, left)
+        late = ground.wider == MOST_WIDER or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
+        return None if late else too_narrow(search, trial)
 
     def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
         chosen = selection.chosen
@@ -378,5 +379,5 @@ def _with(
     recording = recording._replace(checks=(*recording.checks, outliers))
     return Searched(
         search, assessor, selection, gates, disturbance, windows, recording, between_rows, found.degrees_of_freedom,
-        asked, drift=drift, again=again,
+        asked, drift=drift, again=again, by_simulations=by_simulations is not None,
     )  # fmt: skip

@@ -1,19 +1,17 @@
 """What inputs do between rows, asked of planted data where neither simulator nor data say."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Episode, Recording
-from simpel_cli.discovery.search import calibration
 from simpel_cli.discovery.search.between_rows import _better, asked_beside, in_words, preferences, settled, words_of
 from simpel_cli.discovery.search.calibration import prepared
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.likelihood.fit import Fitter
-from simpel_cli.filtering.setup import Setup, key_of, questions, setup, terms_of
+from simpel_cli.filtering.setup import Setup, questions, setup, terms_of
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression
 from simulators.model import Declared, Model
@@ -134,30 +132,6 @@ def test_the_whole_program_takes_the_answer_as_said_and_begins_where_the_small_o
     assert search_of(plan).base().optimum.log_evidence == pytest.approx(everywhere.log_evidence, abs=0.05)
     assert plan.optimum is not None
     np.testing.assert_allclose(plan.optimum[:2], everywhere.z[:2], atol=1e-3)
-
-
-@pytest.mark.parametrize("known", ["drag", "of another model"])
-def test_a_large_model_offers_the_terms_again_that_an_earlier_search_had_a_place_for(
-    known: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Others would be compiled anew; terms that are none of this model are no answer."""
-    data, model = recording(3, u="linear"), rotor(u="linear", v="held")
-    terms = terms_of(model, data, [DRAG])
-    monkeypatch.setattr(calibration, "MOST_PARAMETERS", 1)
-    asked = list[int]()
-
-    def chosen(_: Any, __: Any, ___: Any, ____: Any, terms: Any) -> frozenset[Any]:
-        asked.append(len(terms))
-        return frozenset(key_of(t) for t in terms if t.effect == "unnamed")
-
-    monkeypatch.setattr(calibration, "shortlist", chosen)
-    names = frozenset(key_of(t) for t in terms if t.effect == known) or frozenset({(known, "w", ())})
-    attach, quiet = partial(attached, data=data), Terminal(quiet=True)
-    monkeypatch.setattr(calibration, "questions", lambda _: [])
-    plan, kept, _ = prepared(attach, model, terms, OPTIONS, quiet, names)
-    assert {name for name, *_ in kept or ()} == {"drag" if known == "drag" else "unnamed"}
-    assert {t.effect for t in plan.augmented.terms} == {name for name, *_ in kept or ()}
-    assert asked == ([] if known == "drag" else [len(terms)])
 
 
 @pytest.mark.parametrize("truth", ["linear", "smooth"])

@@ -1,11 +1,13 @@
 """Ranges that are too narrow: widened where evidence asks for it, of the simulator and of effects, and said."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.search import ranges
 from simpel_cli.discovery.search.by_group.own_parameters import written
 from simpel_cli.discovery.search.ranges import in_words, narrowed, too_narrow, translated, widened, within
 from simpel_cli.discovery.search.sets.forward import select
@@ -92,15 +94,36 @@ def test_a_parameter_outside_its_range_is_found_there(b: float, end: int) -> Non
     assert again.optimum.log_evidence < chosen.optimum.log_evidence - 100
 
 
-def test_a_range_that_is_far_too_narrow_widens_until_the_fit_is_inside() -> None:
+def test_a_range_that_is_far_too_narrow_widens_until_the_fit_is_inside(monkeypatch: pytest.MonkeyPatch) -> None:
     search = searched(measured(7.0))
     base = search.base()
     found = too_narrow(search, base)
     assert found is not None
     low, high = found.ranges["b"]
-    assert (low, found.times) == (0.8, 2)  # to 3.8, to 9.8
-    assert 7.0 < high < 10.0
-    assert too_narrow(search, base, 1) is None  # once wider is not enough to be the simpler cause
+    assert low == 0.8
+    assert 7.0 < high < 10.0  # 3.8 is not enough to be the simpler cause
+    monkeypatch.setattr(ranges, "MOST_WIDER", 1)
+    assert too_narrow(search, base) is None
+
+
+@pytest.mark.parametrize(("whole", "steps"), [(False, 1), (True, 2)])
+def test_what_is_left_of_a_model_widens_no_further_than_is_asked(
+    whole: bool, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rest might make up for what it lacks; the whole model lacks nothing that is known, and goes on where it pays."""
+    search = searched(measured(7.0))
+    asked = list[int]()
+    fitted = ranges._fitted
+
+    def counted(*given: Any) -> Any:
+        asked.append(1)
+        return fitted(*given)
+
+    monkeypatch.setattr(ranges, "_fitted", counted)
+    found = ranges._paying(search, search.base(), 0.0, whole=whole)
+    assert found is not None
+    assert len(asked) == steps
+    assert found.ranges["b"][1] == pytest.approx(3.8 if steps == 1 else 9.8)
 
 
 def test_a_range_that_holds_the_truth_stays() -> None:

@@ -879,12 +879,24 @@ def test_a_path_that_stays_behind_the_best_one_goes_no_further() -> None:
     assert set(forward._grow(table.search, start, leader=leader).path[-1].terms) == set(table.terms("AD"))
 
 
-@pytest.mark.parametrize(("promise", "ends"), [({"E": 1.5}, 3), ({"E": 1.5, "C": 1.4}, 4), ({"C": 1.5}, 4), ({}, 4)])
-def test_a_path_that_follows_the_best_one_goes_no_further(promise: dict[str, float], ends: int) -> None:
+@pytest.mark.parametrize(
+    ("promise", "more", "ends"),
+    [
+        ({"E": 1.5}, {}, 3),
+        ({"E": 1.5}, {"AD": 27.0}, 3),
+        ({"E": 1.5}, {"AD": 35.0}, 4),  # it is ahead of the best one with as many effects, AE
+        ({"E": 1.5, "C": 1.4}, {}, 4),
+        ({"C": 1.5}, {}, 4),
+        ({}, {}, 4),
+    ],
+)
+def test_a_path_that_follows_the_best_one_goes_no_further(
+    promise: dict[str, float], more: dict[str, float], ends: int
+) -> None:
     """With D and A it has a part of what the best one has: it goes on only where something else promises about as much."""
-    table = Table({"": 0.0, "A": 30.0, "AD": 60.0, "ADE": 90.0, "ACD": 95.0, "D": 40.0})
+    gains = {"": 0.0, "A": 20.0, "AE": 30.0, "AD": 29.0, "ADE": 90.0, "ACD": 95.0, "D": 15.0}
+    table = Table(gains | more)
     leader = tuple(table.search.part(table.search.base(), table.terms(names)) for names in ("", "A", "AE", "AED"))
-    assert [t.optimum.log_evidence for t in leader] == [0.0, 30.0, 29.0, 90.0]
     table.slopes = promise
     start = leader[0], table.search.part(leader[0], table.terms("D"))
     assert len(forward._grow(table.search, start, leader=leader).path) == ends

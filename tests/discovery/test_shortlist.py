@@ -39,3 +39,30 @@ def test_the_term_that_the_latent_force_looks_like_is_kept(
         assert best < 0.05 * float(np.sum((pushed[:, :-1] / 0.02) ** 2))
     else:
         assert {key[0] for key in kept} == {name}
+
+
+@pytest.mark.parametrize(
+    ("known", "kept"),
+    [
+        ((), {"drag", "load"}),
+        (("drag",), {"drag"}),  # which explains most; the load, which is next, is not worth compiling anew
+        (("load",), {"drag", "load"}),
+        (("drag", "of another model"), {"drag"}),
+        (("of another model",), {"drag", "load"}),
+    ],
+)
+def test_terms_that_have_a_place_keep_it_where_the_best_ones_are_among_them(
+    monkeypatch: pytest.MonkeyPatch, known: tuple[str, ...], kept: set[str]
+) -> None:
+    monkeypatch.setattr(module, "NAMED", 2)
+    monkeypatch.setattr(module, "UNNAMED", 0)
+    search = searched("b")
+    plan, terms = search.plan, [t for t in search.terms if t.effect in ("drag", "load")]
+    random = np.random.default_rng(1)
+    count, rows = plan.windows.y.shape[:2]
+    state, u = random.normal(size=(count, rows, 2)), random.normal(size=(count, rows, 1))
+    v = state[..., 1]
+    pushed = 0.1 - 0.4 * v * np.abs(v) + 0.02 * random.normal(size=v.shape)
+    force = Force(state, np.stack([0 * v, pushed], axis=-1)[:, :-1], np.full((count, rows - 1, 2), 0.02))
+    given = frozenset(next((key_of(t) for t in terms if t.effect == name), (name, "v", ())) for name in known)
+    assert {name for name, *_ in shortlist(plan, plan.start, force, u, terms, given)} == kept

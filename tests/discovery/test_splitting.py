@@ -1,5 +1,7 @@
 """One effect that holds another, and the two that fit as well in its place."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_ranges import cart
@@ -7,10 +9,10 @@ from test_ranges import cart
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.sets.splitting import two_in_place
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
-from simulators.effects import Expression
+from simulators.effects import Expression, Term
 
 WIDTH = {"range": [0.05, 3], "neutral": 0.1, "unit": "m/s", "starts": [0.1, 1]}
 SIZE = {"range": [0, 3], "unit": "m/s^2", "starts": [0.3]}
@@ -43,18 +45,38 @@ def rubbing(noise: float, width: float = 0.05) -> Recording:
     return Recording(tuple(episodes[:3]), tuple(episodes[3:]), (), every, (), (Check("c", True, ""),), ())
 
 
-@pytest.mark.parametrize(("noise", "same"), [(0.05, True), (1e-3, False)])
+def chosen_in(noise: float, *more: Expression) -> tuple[Search, Trial]:
+    """Asymmetric friction, chosen among these effects."""
+    plan = setup(cart(), rubbing(noise), (), [ASYMMETRIC, COULOMB, LOAD, SPRING, *more], 4)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15))
+    (own,) = (t for t, term in enumerate(search.terms) if term.effect == "asymmetric")
+    return search, search.add(search.base(), [own]).trials[0]
+
+
+def names(pairs: list[tuple[Term, Term]]) -> list[list[str]]:
+    return [[t.effect for t in pair] for pair in pairs]
+
+
+@pytest.mark.parametrize(("noise", "same"), [(0.05, True), (0.02, False), (1e-3, False)])
 def test_friction_that_differs_is_coulombs_and_a_load_unless_low_speeds_are_seen(noise: float, same: bool) -> None:
-    plan = setup(cart(), rubbing(noise), (), [ASYMMETRIC, COULOMB, LOAD, SPRING], 4)
-    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=13))
-    place = {term.effect: t for t, term in enumerate(search.terms)}
-    base = search.base()
-    chosen = search.add(base, [place["asymmetric"]]).trials[0]
-    assert chosen.optimum.log_evidence - base.optimum.log_evidence > 50
-    pairs = two_in_place(search, chosen, 0)
-    assert [[t.effect for t in pair] for pair in pairs] == ([["coulomb", "load"]] if same else [])
-    coulomb = search.add(base, [place["coulomb"]]).trials[0]
-    assert two_in_place(search, coulomb, 0) == []  # it holds no other
+    """With 0.02 both promise as much as they have to, and what they are fitted to tells them apart."""
+    search, chosen = chosen_in(noise)
+    assert chosen.optimum.log_evidence - search.base().optimum.log_evidence > 50
+    assert names(two_in_place(search, chosen, 0)) == ([["coulomb", "load"]] if same else [])
+    (coulomb,) = (t for t, term in enumerate(search.terms) if term.effect == "coulomb")
+    assert two_in_place(search, search.add(search.base(), [coulomb]).trials[0], 0) == []  # it holds no other
     search.budget = Budget(1.0, iter([0.0, 2.0]).__next__)
     assert two_in_place(search, chosen, 0) == []
     assert search.budget.left_out == ["two effects in place of one"]
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_a_rival_by_itself_is_no_half_of_a_pair(said: bool) -> None:
+    """The same law in other words does as well without Coulomb friction beside it, known as a case of it or not."""
+    other = replace(
+        ASYMMETRIC, name="other", term="-(m + d*abs(tanh(v/w))/tanh(v/w))*tanh(v/w)",
+        parameters={"m": SIZE, "d": {"range": [-2, 2], "unit": "m/s^2", "starts": [0.2]}, "w": WIDTH},
+        generalises=("coulomb",) if said else (),
+    )  # fmt: skip
+    search, chosen = chosen_in(0.05, other)
+    assert names(two_in_place(search, chosen, 0)) == [["coulomb", "load"]]

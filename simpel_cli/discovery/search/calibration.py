@@ -53,8 +53,7 @@ def prepared(
         terms: all of them.
         options: of the search.
         terminal: takes lines that say what goes on.
-        known: terms that an earlier search had a place for, in other ranges, rows or steps. Those of a large model have one
-            again: others would be compiled anew.
+        known: terms that an earlier search had a place for, in other ranges or steps (see `shortlist`).
     """
     unknowns = sum(len(t.parameters) for t in terms)
     unsaid, many = questions(model), unknowns > MOST_PARAMETERS
@@ -78,11 +77,9 @@ def prepared(
     if found:
         terminal.line(in_words(found), "inputs")
     if many:
-        kept = known & frozenset(map(key_of, terms))
-        if not kept:
-            forces = Forces(plan.rule, plan.coordinates, model.dt)
-            force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
-            kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms)
+        forces = Forces(plan.rule, plan.coordinates, model.dt)
+        force = forces(z, Assessor(plan, options.horizon)(z, plan.windows).track, plan.windows)
+        kept = shortlist(plan, z, force, forces.inputs(z, plan.windows), terms, known)
         left = sum(len(t.parameters) for t in terms if key_of(t) in kept)
         terminal.line(f"{len(kept)} terms with {left} unknowns are worth a fit", "screening")
     whole = attach(saying(model, found), kept=kept)

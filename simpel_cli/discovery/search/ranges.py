@@ -24,7 +24,7 @@ AT_END = 0.005  # of a range: a fit that ends so near to an end of it
 TIMES = 2.0  # spans by which a range becomes wider at that end
 NEAREST = 0.1  # of a bound that is not zero: as near to zero as a wider range comes
 NEARLY_ALL = 0.8  # of what the best effect gains (0.83 on the heaters of TCLab, where it is the range)
-MOST_WIDER = 3  # times that ranges become wider
+MOST_WIDER = 3  # times that ranges become wider, each by so many steps at most
 
 Range = tuple[float, float]
 
@@ -35,23 +35,22 @@ class Wider(NamedTuple):
     Args:
         ranges: by the names of their parameters.
         gain: nats of evidence.
-        times: that ranges became wider.
         earlier: what was chosen without them.
         simulated: likewise by simulations, where these ask for them.
     """
 
     ranges: dict[str, Range]
     gain: float
-    times: int = 1
     earlier: Earlier | None = None
     simulated: Earlier | None = None
 
 
-def too_narrow(search: Search, trial: Trial, most: int = MOST_WIDER) -> Wider | None:
+def too_narrow(search: Search, trial: Trial) -> Wider | None:
     """Return the wider ranges with which a model gains; None: there are none.
 
-    A fit that stands at the end of a wider range, too, asks at once for the next one, `most` times in all, not in a search of
-    its own.
+    A fit that stands at the end of a wider range, too, asks at once for the next one, not in a search of its own: the whole
+    model as long as that pays, the simulator alone and the rest of a model until they gain what is asked of them. Beyond that
+    a range would make up for what is missing.
 
     The simulator alone has to gain with them nearly what it gains with the best effect, or the rest of a model what an effect
     adds to it: that may only make up for them, and that a range is too narrow is the simpler cause.
@@ -60,33 +59,39 @@ def too_narrow(search: Search, trial: Trial, most: int = MOST_WIDER) -> Wider | 
         wider = _wider(search.plan, trial)
         trials = search.add(trial, search.candidates(())).trials if wider else ()
         best = trials[0].optimum.log_evidence - trial.optimum.log_evidence if trials else 0.0
-        return _paying(search, trial, NEARLY_ALL * best - TIE, most)
-    if (found := _paying(search, trial, 0.0, most)) is not None:
+        return _paying(search, trial, NEARLY_ALL * best - TIE)
+    if (found := _paying(search, trial, 0.0, whole=True)) is not None:
         return found
     for gone in trial.terms:
         rest = search.part(trial, tuple(t for t in trial.terms if t != gone))
         earned = trial.optimum.log_evidence - rest.optimum.log_evidence
-        if (found := _paying(search, rest, NEARLY_ALL * earned - TIE, most)) is not None:
+        if (found := _paying(search, rest, NEARLY_ALL * earned - TIE)) is not None:
             return found
     return None
 
 
-def _paying(search: Search, trial: Trial, least: float, most: int) -> Wider | None:
-    """Return the wider ranges with which a model gains so many nats, and what they have to earn; None: it does not."""
+def _paying(search: Search, trial: Trial, least: float, *, whole: bool = False) -> Wider | None:
+    """Return the wider ranges with which a model gains so many nats, and what they have to earn; None: it does not.
+
+    Args:
+        search: that it comes from.
+        trial: the model.
+        least: nats.
+        whole: whether nothing is left out of it, so that ranges widen as long as that pays.
+    """
     plan, wide, found = search.plan, search.plan, None
     names, before, ranges = [q.name for q in plan.augmented.params], trial, dict[int, Range]()
-    for times in range(1, most + 1):
-        if not (wider := _wider(wide, before)):
+    for _ in range(MOST_WIDER):
+        if (found and not whole) or not (wider := _wider(wide, before)):
             break
         wide, z = _ranged(wide, before.optimum.z, wider)
         after = Trial(trial.terms, max(_fitted(search, trial, wide, z), key=lambda o: o.log_evidence))
-        gain = after.optimum.log_evidence - before.optimum.log_evidence
-        if not gain > ACCEPT * len(wider):
+        if not after.optimum.log_evidence - before.optimum.log_evidence > ACCEPT * len(wider):
             break
         ranges |= wider
         gain = after.optimum.log_evidence - trial.optimum.log_evidence
         if gain > least:
-            found = Wider({names[row]: ends for row, ends in ranges.items()}, float(gain), times)
+            found = Wider({names[row]: ends for row, ends in ranges.items()}, float(gain))
         before = after
     return found
 

@@ -9,7 +9,7 @@ with the known parameters taken out of both sides first (Frisch and Waugh 1933).
 and keep their place.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,12 +22,20 @@ from simulators.effects.term import OPERATORS, SENSOR
 
 MOST_PARAMETERS = 160  # of a program with every term
 NAMED, UNNAMED = 60, 24  # unknowns of named effects and of functions that are kept by their gain
+HALF = 0.5  # of the places: what gains so much decides whether others will do
 ROWS = 1000  # looked at
 NUDGE = 1e-4  # of the range of a known parameter
 
 
-def shortlist(plan: Setup, z: np.ndarray, force: Force, inputs: np.ndarray, terms: Sequence[Term]) -> frozenset[Key]:
-    """Return the terms that are worth compiling.
+def shortlist(
+    plan: Setup,
+    z: np.ndarray,
+    force: Force,
+    inputs: np.ndarray,
+    terms: Sequence[Term],
+    known: frozenset[Key] = frozenset(),
+) -> frozenset[Key]:
+    """Return the terms that are worth compiling: those that have a place already, where the better half is among them.
 
     Args:
         plan: of the simulator alone.
@@ -35,10 +43,18 @@ def shortlist(plan: Setup, z: np.ndarray, force: Force, inputs: np.ndarray, term
         force: its latent force on the training windows.
         inputs: (W, T, nu) as they arrive.
         terms: all of them.
+        known: terms that have a place in a program that is compiled.
     """
     gains = dict(zip(map(key_of, terms), _gains(plan, z, force, inputs, terms), strict=True))
+    known = known & frozenset(gains)
+    return known if known and _by_gain(gains, terms, HALF) <= known else _by_gain(gains, terms)
+
+
+def _by_gain(gains: Mapping[Key, float], terms: Sequence[Term], share: float = 1.0) -> frozenset[Key]:
+    """Return the terms that gain most, as far as a share of the places goes, and those of which the rates tell nothing."""
     kept = {key for key, gain in gains.items() if gain == np.inf}
-    for named, capacity in ((True, NAMED), (False, UNNAMED)):
+    for named, places in ((True, NAMED), (False, UNNAMED)):
+        capacity = share * places
         ranked = sorted((t for t in terms if bool(t.depends_on) is not named), key=lambda t: -gains[key_of(t)])
         for term in ranked:
             if key_of(term) not in kept and len(term.parameters) <= capacity:

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from simpel_cli.discovery.search.budget import Budget
-from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread
+from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread, slots_of
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.race import Race
 from simpel_cli.filtering.setup import Key, Setup
 from simpel_cli.filtering.two_optima import other_optima
-from simulators.groups import SPREAD, slot_names, spreads_of
+from simulators.groups import spreads_of
 
 ACCEPT = 4.5  # nats of evidence that an effect must earn
 FURTHER = 2.3  # nats more for every effect that is there already: each makes another one ten times less probable
@@ -93,7 +93,7 @@ class Search:
         differing = [plan.augmented.spreads(t) for t in self.terms]
         self.members = [tuple(i for own in each.values() for i in own[:-1]) for each in differing]
         self.spreads = every | {row: own[:-1] for each in differing for row, own in each.items()}
-        self.slot_of = _slots(plan, every)
+        self.slot_of = slots_of(plan, every)
         self.spreads_of = [tuple(each) for each in differing]
         inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner
@@ -136,6 +136,15 @@ class Search:
         """Return what each start of each term, or each set of starts together, promises beside a fitted set of terms."""
         free, z = self.free(before.terms), before.optimum.z
         return promises(self.plan, self.fitter, self.fitter.width, free, z, starts, sets)
+
+    def promised(self, before: Trial, candidates: Sequence[int]) -> list[tuple[int, Hypothesis, Score]]:
+        """Return every start of every candidate with what it promises, which is not worked out again."""
+
+        def work() -> list[tuple[int, Hypothesis, Score]]:
+            starts = self.starts(before, candidates)
+            return [(*s, score) for s, score in zip(starts, self.promises(before, starts), strict=True)]
+
+        return self.once(("promised", before.terms, before.optimum.z.tobytes(), tuple(candidates)), work)
 
     def hypotheses(self, terms: tuple[int, ...], new: int, z: np.ndarray) -> list[Hypothesis]:
         """Starts of a set of terms of which one is new and begins at each of its start points."""
@@ -254,8 +263,8 @@ class Search:
         self, before: Trial, candidates: Sequence[int], least: float, more: Sequence[tuple[int, Hypothesis]]
     ) -> Stage:
         self.tried += len(candidates)
-        starts = self.starts(before, candidates)
-        scores = self.promises(before, starts)
+        each = self.promised(before, candidates)
+        starts, scores = [(t, hypothesis) for t, hypothesis, _ in each], [score for *_, score in each]
         promised, sure = np.array([(score.gain, score.sure) for score in scores]).reshape(-1, 2).T
         order = sorted(range(len(starts)), key=lambda i: -promised[i])
         named = np.array([not self.terms[t].depends_on for t, _ in starts], bool)
@@ -380,21 +389,3 @@ class Search:
             return False
         fits = len(term.parameters) <= len(self.terms[own].parameters) and here.loss <= there.loss + SAME
         return fits or here.log_evidence >= there.log_evidence - TIE
-
-
-def _slots(plan: Setup, own: dict[int, list[int]]) -> dict[int, int]:
-    """Return what every group is -> the input that says that a row is of it."""
-    model = plan.augmented.model
-    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
-    found = {
-        names.index(q.name): inputs.index(slot)
-        for term in plan.augmented.terms
-        for g in term.groupings
-        for q, slot in zip(g.members, g.slots, strict=True)
-    }
-    columns = {f"{name}_{SPREAD}": by for name, by in model.base.per.items()} if model.base else {}
-    for spread, rows in own.items():
-        by = columns[model.params[spread].name]
-        slots = slot_names(by, model.groups[by])[:-1]  # without the group that was never seen
-        found |= {row: inputs.index(slot) for row, slot in zip(rows, slots, strict=True)}
-    return found

@@ -1,6 +1,6 @@
 """The verdict of a search: effect, ambiguous, none or unexplained, as `verdict.json` holds it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,6 @@ from simpel_cli.data.recording import Check
 from simpel_cli.discovery.search.by_group.strangers import assessed
 from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, errors_of, growing
 from simpel_cli.discovery.search.sets.selection import Selection
-from simpel_cli.discovery.search.sets.splitting import two_in_place
 from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
@@ -19,6 +18,7 @@ from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_in
 from simpel_cli.filtering.independent_parts import independent_parts
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Q_BOUNDS, key_of
+from simulators.effects import Term
 from simulators.groups import MEMBER, SPREAD
 
 EFFECT, AMBIGUOUS, NONE, UNEXPLAINED = "effect", "ambiguous", "none", "unexplained"
@@ -39,6 +39,7 @@ def verdict_of(
     checks: tuple[Check, ...],
     horizon: int,
     seconds: float,
+    pairs: Sequence[Sequence[tuple[Term, Term]]] = (),
 ) -> dict[str, Any]:
     """Return `verdict.json`.
 
@@ -53,9 +54,13 @@ def verdict_of(
         checks: of the data.
         horizon: rows.
         seconds: of the search.
+        pairs: per chosen term, effects that together these data cannot tell from it.
     """
     chosen = selection.chosen
-    effects = [_effect(search, selection, i, gates[i] if i < len(gates) else None) for i in range(len(chosen.terms))]
+    effects = [
+        _effect(search, selection, i, gates[i] if i < len(gates) else None, pairs[i] if i < len(pairs) else ())
+        for i in range(len(chosen.terms))
+    ]
     different = [_distinct(e) for e in effects]
     if not effects:
         kind = UNEXPLAINED if remainder else NONE
@@ -69,12 +74,12 @@ def verdict_of(
             remainder or still_wrong(search, chosen, measured[part.worst], part.times, horizon),
         )
     rows = max(float((windows.ok > 0).any(axis=2).sum()), 1.0)
-    pairs = {
+    errors = {
         words: independent_parts(e, errors_of(after)[words], windows.episode) for words, e in errors_of(before).items()
     }
-    ahead = pairs[AHEAD["ahead"]]
+    ahead = errors[AHEAD["ahead"]]
     interval = reduction_interval(ahead.before, ahead.after, ahead.parts, np.random.default_rng(2))
-    first, second, parts = ({words: pair[k] for words, pair in pairs.items()} for k in range(3))
+    first, second, parts = ({words: pair[k] for words, pair in errors.items()} for k in range(3))
     grows = growing(first, second, measured, parts)
     found = {
         "verdict": kind,
@@ -156,7 +161,9 @@ def before_of(search: Search, base: Trial, row: int) -> dict[str, float]:
     return {name: float(np.clip(value, *ends)) for name, value in interval_of(search, base, row).items()}
 
 
-def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> dict[str, Any]:
+def _effect(
+    search: Search, selection: Selection, i: int, gate: Gate | None, pairs: Sequence[tuple[Term, Term]]
+) -> dict[str, Any]:
     term = search.terms[selection.chosen.terms[i]]
     rows = search.rows[selection.chosen.terms[i]]
     others = [(search.terms[t.terms[-1]], t) for t in selection.classes[i]]
@@ -181,10 +188,7 @@ def _effect(search: Search, selection: Selection, i: int, gate: Gate | None) -> 
         "class_acts_on": places,
         "class_members": members,
         "same_as": list(dict.fromkeys([*term.same_as, *same])),
-        "same_as_two": [
-            [{"name": t.effect, "acts_on": t.acts_on} for t in pair]
-            for pair in two_in_place(search, selection.chosen, i)
-        ],
+        "same_as_two": [[{"name": t.effect, "acts_on": t.acts_on} for t in pair] for pair in pairs],
         "log_evidence_gain": selection.gains[i],
         "held_out_gain": None if gate is None else gate._asdict(),
         "parameters": {
@@ -309,5 +313,5 @@ def _phrase(effect: dict[str, Any]) -> str:
         " with ".join(f"{m['name'].replace('_', ' ')} on {m['acts_on']}" for m in pair)
         for pair in effect["same_as_two"]
     ]
-    two = f", to these data no other than {' or '.join(pairs)}" if pairs else ""
+    two = f", which these data cannot tell from {' or from '.join(pairs)}" if pairs else ""
     return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}{two}"

@@ -13,7 +13,9 @@ import numpy as np
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hopes, Hypothesis, Optimum
 from simpel_cli.filtering.measurements.windows import Windows
+from simpel_cli.filtering.setup import Setup
 from simpel_cli.priors.spreads import LEAST, factor_of, sd_of_log
+from simulators.groups import SPREAD, slot_names
 
 BEGIN = 0.35  # of the largest spread, where a fit begins
 ROUNDS = 4  # of fits with another spread
@@ -151,3 +153,21 @@ def respread(
             z[i] = coordinates.unit(i, before / after * coordinates.value(i, float(z[i])))
         z[row] = level
     return z
+
+
+def slots_of(plan: Setup, own: Mapping[int, Sequence[int]]) -> dict[int, int]:
+    """Return what every group is -> the input that says that a row is of it."""
+    model = plan.augmented.model
+    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
+    found = {
+        names.index(q.name): inputs.index(slot)
+        for term in plan.augmented.terms
+        for g in term.groupings
+        for q, slot in zip(g.members, g.slots, strict=True)
+    }
+    columns = {f"{name}_{SPREAD}": by for name, by in model.base.per.items()} if model.base else {}
+    for spread, rows in own.items():
+        by = columns[model.params[spread].name]
+        slots = slot_names(by, model.groups[by])[:-1]  # without the group that was never seen
+        found |= {row: inputs.index(slot) for row, slot in zip(rows, slots, strict=True)}
+    return found

@@ -13,7 +13,7 @@ from simpel_cli.discovery.search.sets.merging import merged
 from simpel_cli.discovery.search.sets.pairs import together
 from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, nameless, path_of, worth
-from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, NEARLY_THE_BEST, TIE, Search, Stage, Trial, asked
+from simpel_cli.discovery.search.trials import ACCEPT, ASTRAY, TIE, Search, Stage, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simulators.effects import Term
 
@@ -22,6 +22,7 @@ MOST_MERGERS = 2
 MOST_RUNNERS_UP = 8  # effects that a search could begin with
 BEGINNINGS = 2  # that it does begin with, beside the one that explains most
 GUARD = 1000.0  # nats: so large a gain says that the smaller model had not found its optimum
+FAR_MORE = 1.5  # times as much as everything else, which an effect of the best path promises
 MOST_BEHIND = 2  # effects in a row with which a path may be worth less than the best one so far with as many
 
 
@@ -167,7 +168,7 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
         path: to begin with.
         widely: the first one, and one at the end, may begin anywhere in its ranges.
         leader: the best path so far: one that falls behind it, or comes to the same effects, goes no further; nor does one that
-            has come to a part of them, where what promises most beside these is the leader's, too.
+            has come to a part of them, where what promises by far most beside these is the leader's, too.
     """
     stages: list[Stage] = []
     wide, behind = widely, 0
@@ -210,20 +211,25 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
             there = leader[len(best.terms)]
             behind = behind + 1 if worth(best) < worth(there) else 0
             alike = set(best.terms) == set(there.terms) and worth(best) <= worth(there) + ASTRAY
-            if behind == MOST_BEHIND or alike or _follows(search, best, leader[-1]):
+            if behind == MOST_BEHIND or alike or _follows(search, best, leader):
                 return _Grown(path, tuple(stages), None)
 
 
-def _follows(search: Search, trial: Trial, leading: Trial) -> bool:
-    """Whether a model has a part of another one's effects, the rest of which promise far more beside it than what it lacks."""
-    ahead = set(leading.terms)
-    if not set(trial.terms) < ahead:
+def _follows(search: Search, trial: Trial, leader: tuple[Trial, ...]) -> bool:
+    """Whether a model has a part of the best one's effects, the rest of which promise far more beside it than what it lacks.
+
+    Not if it is ahead of the best path with as many. What cannot be told is left to the best path, which has tried it.
+    """
+    ahead = set(leader[-1].terms)
+    if not set(trial.terms) < ahead or worth(trial) > worth(leader[len(trial.terms)]) + ASTRAY:
         return False
-    starts = search.starts(trial, [t for t in search.candidates(trial.terms) if not search.terms[t].depends_on])
     own, others = 0.0, 0.0
-    for (t, _), score in zip(starts, search.promises(trial, starts), strict=True):
-        own, others = (max(own, score.sure), others) if t in ahead else (own, max(others, score.sure))
-    return others < NEARLY_THE_BEST * own
+    for t, _, score in search.promised(trial, search.candidates(trial.terms)):
+        if t in ahead:
+            own = max(own, score.sure)
+        elif not search.terms[t].depends_on:
+            others = max(others, score.sure)
+    return FAR_MORE * others < own
 
 
 def _otherwise(search: Search, grown: _Grown, most: int) -> Iterator[_Grown]:

@@ -4,6 +4,8 @@ Dry friction that differs between the directions is Coulomb friction beside a co
 name is wrong where the data show little of those, and one effect is the shorter answer: the pairs are said beside it.
 """
 
+import numpy as np
+
 from simpel_cli.discovery.search.trials import SAME, TIE, Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simulators.effects import Term
@@ -17,6 +19,8 @@ FITTED = 4  # pairs
 def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, Term]]:
     """Return the pairs that fit as well as one chosen effect: a special case of it where it acts, and another effect.
 
+    Neither alone does, and the other one is no more general form of the special case: that would be a rival by itself.
+
     Args:
         search: over sets of effects.
         chosen: the model.
@@ -24,33 +28,61 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
     """
     own = chosen.terms[place]
     term, rest = search.terms[own], tuple(t for t in chosen.terms if t != own)
-    simpler = [
-        t for t in search.candidates(rest)
-        if search.terms[t].effect in term.generalises and search.terms[t].acts_on == term.acts_on
-    ]  # fmt: skip
+    simpler = [t for t in search.candidates(rest) if t != own and _is_special(search.terms[t], term)]
     if not simpler or search.budget.over("two effects in place of one"):
         return []
+    search.report(f"is {term.label} two effects")
     # the model may have been calibrated for another use: pairs are compared with what it is worth row by row
-    whole = _best(search, [Hypothesis(chosen.optimum.z, search.free(chosen.terms), search.ones)])
+    z = chosen.optimum.z
+    whole = _best(
+        search, chosen.terms, [Hypothesis(at, search.free(chosen.terms), search.ones) for at in (z, search.loud(z))]
+    )
+    off = search.off(whole.z, (own,))
     found = []
     for special in simpler:
         less = (*rest, special)
-        fit = _best(search, search.hypotheses(less, special, search.off(whole.z, (own,))))
-        if fit.log_evidence >= whole.log_evidence - TIE:
+        before = Trial(less, _best(search, less, search.hypotheses(less, special, off)))
+        if _as_good(before.optimum, whole):
             continue  # alone it is a rival, and named as one
-        before = Trial(less, fit)
-        candidates = [t for t in search.candidates(less) if t != own and not search.terms[t].depends_on]
-        starts = search.starts(before, candidates)
-        promised = dict[int, float]()
-        for (t, _), score in zip(starts, search.promises(before, starts), strict=True):
-            promised[t] = max(promised.get(t, 0.0), score.gain)
-        hopeful = [t for t in promised if promised[t] > MOST_OF_IT * (fit.loss - whole.loss)]
-        for t in sorted(hopeful, key=lambda t: -promised[t])[:FITTED]:
-            pair = _best(search, search.hypotheses((*less, t), t, fit.z))
-            if pair.loss <= whole.loss + SAME or pair.log_evidence >= whole.log_evidence - TIE:
+        others = [
+            t for t in search.candidates(less)
+            if t != own and not search.terms[t].depends_on and not _is_special(search.terms[special], search.terms[t])
+        ]  # fmt: skip
+        for t in _promising(search, before, others, MOST_OF_IT * (before.optimum.loss - whole.loss)):
+            pair, alone = (*less, t), (*rest, t)
+            if not _as_good(_best(search, pair, search.hypotheses(pair, t, before.optimum.z)), whole):
+                continue
+            if not _as_good(_best(search, alone, search.hypotheses(alone, t, off)), whole):
                 found.append((search.terms[special], search.terms[t]))
     return found
 
 
-def _best(search: Search, hypotheses: list[Hypothesis]) -> Optimum:
-    return max(search.fitter(hypotheses), key=lambda o: o.log_evidence)
+def _is_special(simple: Term, general: Term) -> bool:
+    """Whether an effect is a special case of another, where that acts or takes from."""
+    place, *_ = general.acts_on.split(", ")
+    return simple.effect in general.generalises and place in (simple.acts_on, *simple.acts_on.split(", "))
+
+
+def _promising(search: Search, before: Trial, candidates: list[int], least: float) -> list[int]:
+    """Return the terms that promise most beside a model, at least so many nats; what cannot be told is left out."""
+    starts = search.starts(before, candidates)
+    search.tried += len(candidates)
+    promised = dict[int, float]()
+    for (t, _), score in zip(starts, search.promises(before, starts), strict=True):
+        if np.isfinite(score.gain):
+            promised[t] = max(promised.get(t, 0.0), score.gain)
+    return sorted((t for t in promised if promised[t] > least), key=lambda t: -promised[t])[:FITTED]
+
+
+def _best(search: Search, terms: tuple[int, ...], hypotheses: list[Hypothesis]) -> Optimum:
+    """Return the best of some fits, each of which is fitted once more from where it ended, and of those known."""
+    first = search.fitter(hypotheses)
+    again = search.fitter([Hypothesis(search.loud(o.z), o.free, search.ones) for o in first])
+    known = [search.known[frozenset(terms)]] if frozenset(terms) in search.known else []
+    return max([*first, *again, *known], key=lambda o: o.log_evidence)
+
+
+def _as_good(fit: Optimum, whole: Optimum) -> bool:
+    """Whether a model does as well as another one, and no better; widths of priors alone tell no two apart."""
+    alike = len(fit.free) <= len(whole.free) and abs(fit.loss - whole.loss) <= SAME
+    return alike or abs(fit.log_evidence - whole.log_evidence) <= TIE
