@@ -681,6 +681,39 @@ def test_what_stands_for_two_is_asked_about_before_it_is_judged(monkeypatch: pyt
     assert not judged_of
 
 
+@pytest.mark.parametrize("answers", [True, False])
+def test_what_is_left_is_asked_about_before_another_effect_is_looked_for(
+    answers: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What did harm may have made up for a range; what would stand in its place then makes up for it, too."""
+    two, one, three, asked_of, grown = (
+        chosen_so("two", 2),
+        chosen_so("one", 1),
+        chosen_so("three", 3),
+        list[Any](),
+        list[Any](),
+    )
+
+    def ask(selection: Any) -> str | None:
+        asked_of.append(selection.chosen.optimum)
+        return "wider" if answers and selection is one else None
+
+    def further(_: Any, left: Any) -> Any:
+        grown.append(left.chosen.optimum)
+        return three
+
+    monkeypatch.setattr(acceptance, "condensed", lambda _, found: found)
+    monkeypatch.setattr(acceptance, "further", further)
+    judged = iter([(one, ["judged"], [1]), (three, ["judged"], [])])
+    monkeypatch.setattr(acceptance, "gated_selection", lambda *_: next(judged))
+    none: Any = None
+    search: Any = SimpleNamespace(budget=Budget())
+    outcome = unwrap(judgement)(search, none, two, none, ask=ask)
+    assert outcome == ("wider" if answers else (three, ["judged"]))
+    assert asked_of == ["two", "one"] + ([] if answers else ["three"])
+    assert grown == ([] if answers else ["one"])
+
+
 @pytest.mark.parametrize("named", [0, MOST_MERGERS])
 def test_a_function_in_place_of_two_is_kept_in_mind_after_mergers(named: int, monkeypatch: pytest.MonkeyPatch) -> None:
     optimum: Any = SimpleNamespace(log_evidence=0.0)

@@ -68,7 +68,8 @@ def judgement(
         terminal: takes lines.
         use: what the model will be calibrated for in the end.
         ask: whether something else has to be known first. Asked of whatever is judged, before that, and of what is left, if
-            something was refused: it may have made up for a range, or have hidden heavy tails.
+            something was refused, before another effect is looked for: it may have made up for a range, or have hidden heavy
+            tails.
 
     Returns:
         what is left with its gates, all of which have been judged; or the first answer.
@@ -83,12 +84,13 @@ def judgement(
         proposal = selection.chosen.terms
         selection, found, harmful = gated_selection(search, assessor, selection, terminal, use)
         search_on -= 1
+        if selection.chosen.terms != proposal and (answer := ask(selection)) is not None:
+            return answer
         if harmful and search_on and not search.budget.over("what an effect that did harm stood for"):
             left, selection = selection, further(search, selection)
             if selection.chosen.terms != left.chosen.terms:
                 continue
-        answer = ask(selection) if selection.chosen.terms != proposal else None
-        return (selection, found) if answer is None else answer
+        return selection, found
 
 
 def accepted(
