@@ -313,5 +313,5 @@ def _phrase(effect: dict[str, Any]) -> str:
         " with ".join(f"{m['name'].replace('_', ' ')} on {m['acts_on']}" for m in pair)
         for pair in effect["same_as_two"]
     ]
-    two = f", which these data cannot tell from {' or from '.join(pairs)}" if pairs else ""
+    two = f" (which these data cannot tell from {', or from '.join(pairs)})" if pairs else ""
     return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}{two}"
