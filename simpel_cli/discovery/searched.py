@@ -196,10 +196,10 @@ def _chosen_in(
     """Search and judge; nothing is judged on held-out episodes in ranges too narrow, steps too coarse, or the wrong noise."""
     options = ground.options
 
-    def wrong(selection: Selection) -> First | _Heavy | None:
+    def wrong(selection: Selection, tails: bool) -> First | _Heavy | None:
         if (first := unsound(found.search, selection)) is not None:
             return _told(first, found, selection)
-        heavy = None if beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
+        heavy = None if not tails or beaten(found.search, selection) else _heavy(found, assessor, selection, ground)
         return None if heavy is None else _Heavy(heavy, chosen_of(found, selection))
 
     if earlier is not None and earlier.heavy:

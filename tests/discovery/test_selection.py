@@ -668,7 +668,7 @@ def test_what_stands_for_two_is_asked_about_before_it_is_judged(monkeypatch: pyt
     """Its ranges are not known yet."""
     two, one, asked_of, judged_of = chosen_so("two", 2), chosen_so("one", 1), list[Any](), list[Any]()
 
-    def ask(selection: Any) -> str | None:
+    def ask(selection: Any, _: bool) -> str | None:
         asked_of.append(selection.chosen.optimum)
         return "wider" if selection is one else None
 
@@ -694,8 +694,8 @@ def test_what_is_left_is_asked_about_before_another_effect_is_looked_for(
         list[Any](),
     )
 
-    def ask(selection: Any) -> str | None:
-        asked_of.append(selection.chosen.optimum)
+    def ask(selection: Any, tails: bool) -> str | None:
+        asked_of.append((selection.chosen.optimum, tails))
         return "wider" if answers and selection is one else None
 
     def further(_: Any, left: Any) -> Any:
@@ -710,7 +710,8 @@ def test_what_is_left_is_asked_about_before_another_effect_is_looked_for(
     search: Any = SimpleNamespace(budget=Budget())
     outcome = unwrap(judgement)(search, none, two, none, ask=ask)
     assert outcome == ("wider" if answers else (three, ["judged"]))
-    assert asked_of == ["two", "one"] + ([] if answers else ["three"])
+    # what the refused effect explains looks like heavy tails: these are asked of what stands in the end
+    assert asked_of == [("two", True), ("one", False)] + ([] if answers else [("three", True)])
     assert grown == ([] if answers else ["one"])
 
 
@@ -910,6 +911,18 @@ def test_a_path_that_stays_behind_the_best_one_goes_no_further() -> None:
     assert len(forward._grow(table.search, start).path[-1].terms) == 5
     start = leader[0], table.search.part(leader[0], table.terms("D"))
     assert set(forward._grow(table.search, start, leader=leader).path[-1].terms) == set(table.terms("AD"))
+
+
+@pytest.mark.parametrize("useless", ["", "CD"])
+def test_a_path_that_was_cut_and_is_worth_more_goes_on(useless: str) -> None:
+    """What was chosen in other ranges may hold effects that earn nothing here; a part of it that is worth more is no end."""
+    gains = {"": 0.0, "A": 100.0, "AB": 140.0, "ABE": 155.0, "B": 40.0, "E": 15.0}
+    names = "ABE" + useless
+    whole = {names[: k + 1]: 155.0 for k in range(3, len(names))}
+    table = Table(gains | whole)
+    begun = tuple(table.search.part(table.search.base(), table.terms(names[:k])) for k in range(len(names) + 1))
+    found = forward.selected(table.search, begun[0], 0, begun)
+    assert {table.search.terms[t].effect for t in found.chosen.terms} == {*"ABE"}
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def proposed(
 
 def judgement(
     search: Search, assessor: Assessor, selection: Selection, terminal: Terminal, use: str | float = ONE_STEP,
-    ask: Callable[[Selection], Answer | None] = lambda _: None,
+    ask: Callable[[Selection, bool], Answer | None] = lambda *_: None,
 ) -> tuple[Selection, list[Gate]] | Answer:  # fmt: skip
     """Judge what is proposed, and go on without an effect that does harm: another one may be what it stood for.
 
@@ -68,29 +68,30 @@ def judgement(
         terminal: takes lines.
         use: what the model will be calibrated for in the end.
         ask: whether something else has to be known first. Asked of whatever is judged, before that, and of what is left, if
-            something was refused, before another effect is looked for: it may have made up for a range, or have hidden heavy
-            tails.
+            something was refused: it may have made up for a range, or have hidden heavy tails. Before another effect is looked
+            for in its place it is asked without tails (False): what that effect explains looks like tails.
 
     Returns:
         what is left with its gates, all of which have been judged; or the first answer.
     """
     search_on = MOST_SEARCHES
     while True:
-        if (answer := ask(selection)) is not None:
+        if (answer := ask(selection, True)) is not None:
             return answer
         before, selection = selection.chosen.terms, condensed(search, selection)
-        if selection.chosen.terms != before and (answer := ask(selection)) is not None:
+        if selection.chosen.terms != before and (answer := ask(selection, True)) is not None:
             return answer
         proposal = selection.chosen.terms
         selection, found, harmful = gated_selection(search, assessor, selection, terminal, use)
         search_on -= 1
-        if selection.chosen.terms != proposal and (answer := ask(selection)) is not None:
-            return answer
         if harmful and search_on and not search.budget.over("what an effect that did harm stood for"):
+            if selection.chosen.terms != proposal and (answer := ask(selection, False)) is not None:
+                return answer
             left, selection = selection, further(search, selection)
             if selection.chosen.terms != left.chosen.terms:
                 continue
-        return selection, found
+        answer = ask(selection, True) if selection.chosen.terms != proposal else None
+        return (selection, found) if answer is None else answer
 
 
 def accepted(

@@ -77,7 +77,7 @@ def _paying(search: Search, trial: Trial, least: float, *, whole: bool = False) 
         search: that it comes from.
         trial: the model.
         least: nats.
-        whole: whether nothing is left out of it, so that ranges widen as long as that pays.
+        whole: whether it is what stands, not a part of that: its ranges widen as long as that pays.
     """
     plan, wide, found = search.plan, search.plan, None
     names, before, ranges = [q.name for q in plan.augmented.params], trial, dict[int, Range]()

@@ -103,7 +103,7 @@ def chosen_by_simulations(
     known = path_in(simulated, path[0], earlier) if earlier is not None else ()
     begun = max(begun, known or begun, key=lambda p: worth(p[-1]))
 
-    def ask(at: Selection) -> Wider | None:
+    def ask(at: Selection, _: bool) -> Wider | None:
         ends = wider(simulated, at.chosen)
         return ends and ends._replace(simulated=Earlier(simulated, at.chosen))
 

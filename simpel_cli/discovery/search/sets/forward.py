@@ -27,11 +27,15 @@ MOST_BEHIND = 2  # effects in a row with which a path may be worth less than the
 
 
 class _Grown(NamedTuple):
-    """Where adding effects ended: the fits on the way, what was tried, and an unnamed function still asked for."""
+    """Where adding effects ended: the fits on the way, what was tried, and an unnamed function still asked for.
+
+    `cut`: it went no further since another path led.
+    """
 
     path: tuple[Trial, ...]
     stages: tuple[Stage, ...]
     remainder: tuple[Term, float] | None
+    cut: bool = False
 
 
 def select(
@@ -63,10 +67,11 @@ def selected(
         search.report(f"beginning with {' and '.join(search.terms[t].label for t in begun[-1].terms)}")
         again = _grow(search, begun)
         again = again._replace(stages=(*grown.stages[:1], *again.stages))
-        grown = max(grown, again, key=lambda g: worth(g.path[-1]))
+        grown = _whole(search, max(grown, again, key=lambda g: worth(g.path[-1])))
     several = len(grown.path) > 2 or grown.remainder
     if beginnings and several and not search.budget.over("searches that begin with another effect"):
-        grown = max([grown, *_otherwise(search, grown, beginnings)], key=lambda g: worth(g.path[-1]))
+        others = _otherwise(search, grown, beginnings)
+        grown = _whole(search, max([grown, *others], key=lambda g: worth(g.path[-1])))
     found = _ended(search, _paired(search, grown))
     # what is not needed any more may have hidden another one
     if settled and len(found.chosen.terms) < len(begun[-1].terms):
@@ -212,7 +217,15 @@ def _grow(search: Search, path: tuple[Trial, ...], *, widely: bool = False, lead
             behind = behind + 1 if worth(best) < worth(there) else 0
             alike = set(best.terms) == set(there.terms) and worth(best) <= worth(there) + ASTRAY
             if behind == MOST_BEHIND or alike or _follows(search, best, leader):
-                return _Grown(path, tuple(stages), None)
+                return _Grown(path, tuple(stages), None, cut=True)
+
+
+def _whole(search: Search, grown: _Grown) -> _Grown:
+    """Go on with a path that was cut for another one and is worth more: what led may hold effects that earn nothing."""
+    if not grown.cut:
+        return grown
+    more = _grow(search, grown.path)
+    return more._replace(stages=(*grown.stages, *more.stages))
 
 
 def _follows(search: Search, trial: Trial, leader: tuple[Trial, ...]) -> bool:

@@ -38,11 +38,11 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
         search, chosen.terms, [Hypothesis(at, search.free(chosen.terms), search.ones) for at in (z, search.loud(z))]
     )
     off = search.off(whole.z, (own,))
-    found = []
+    found: list[tuple[int, int]] = []
     for special in simpler:
         less = (*rest, special)
         before = Trial(less, _best(search, less, search.hypotheses(less, special, off)))
-        if _as_good(before.optimum, whole):
+        if _as_good(before.optimum, whole) or _better(before.optimum, whole):
             continue  # alone it is a rival, and named as one
         others = [
             t for t in search.candidates(less)
@@ -52,9 +52,11 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
             pair, alone = (*less, t), (*rest, t)
             if not _as_good(_best(search, pair, search.hypotheses(pair, t, before.optimum.z)), whole):
                 continue
-            if not _as_good(_best(search, alone, search.hypotheses(alone, t, off)), whole):
-                found.append((search.terms[special], search.terms[t]))
-    return found
+            by_itself = _best(search, alone, search.hypotheses(alone, t, off))
+            known = any({special, t} == {*earlier} for earlier in found)
+            if not (known or _as_good(by_itself, whole) or _better(by_itself, whole)):
+                found.append((special, t))
+    return [(search.terms[special], search.terms[t]) for special, t in found]
 
 
 def _is_special(simple: Term, general: Term) -> bool:
@@ -86,3 +88,7 @@ def _as_good(fit: Optimum, whole: Optimum) -> bool:
     """Whether a model does as well as another one, and no better; widths of priors alone tell no two apart."""
     alike = len(fit.free) <= len(whole.free) and abs(fit.loss - whole.loss) <= SAME
     return alike or abs(fit.log_evidence - whole.log_evidence) <= TIE
+
+
+def _better(fit: Optimum, whole: Optimum) -> bool:
+    return fit.log_evidence > whole.log_evidence
