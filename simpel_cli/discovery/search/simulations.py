@@ -113,7 +113,7 @@ def chosen_by_simulations(
         return outcome
     judged, gates = outcome
     other, gates = accepted(simulated, assessor, judged, gates, terminal)
-    if other.chosen.terms != judged.chosen.terms and (ends := ask(other)) is not None:
+    if other.chosen.terms != judged.chosen.terms and (ends := ask(other, True)) is not None:
         return ends
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
