@@ -190,7 +190,7 @@ class _Heavy(NamedTuple):
 
 
 def _chosen_in(
-    found: Calibrated, assessor: Assessor, ground: Ground, unsound: Callable[[Search, Selection], Wider | Finer | None],
+    found: Calibrated, assessor: Assessor, ground: Ground, unsound: Callable[[Search, Selection], First | None],
     earlier: Earlier | None = None,
 ) -> tuple[Calibrated, Selection, list[Gate]] | First:  # fmt: skip
     """Search and judge; nothing is judged on held-out episodes in ranges too narrow, steps too coarse, or the wrong noise."""
@@ -229,7 +229,7 @@ def _with_tails(found: Calibrated, assessor: Assessor, trial: Trial, ground: Gro
     return heavy
 
 
-def _told(first: Wider | Finer, found: Calibrated, selection: Selection) -> Wider | Finer:
+def _told(first: First, found: Calibrated, selection: Selection) -> First:
     """Return what has to be known first, with what was chosen without it; finer steps ask only what stands beside that."""
     return first._replace(earlier=chosen_of(found, selection)._replace(settled=isinstance(first, Finer)))
 
@@ -263,7 +263,7 @@ def _with(
         late = ground.wider == MOST_WIDER or (trial.terms and ground.budget.over("wider ranges, beside the effects"))
         return None if late else too_narrow(search, trial)
 
-    def unsound(search: Search, selection: Selection) -> Wider | Finer | None:
+    def unsound(search: Search, selection: Selection) -> First | None:
         chosen = selection.chosen
         open_ = options.substeps is None or ground.finer
         if open_ and not (chosen.terms and ground.budget.over("finer integration steps")):

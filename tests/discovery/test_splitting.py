@@ -1,6 +1,9 @@
 """One effect that holds another, and the two that fit as well in its place."""
 
 from dataclasses import replace
+from inspect import unwrap
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +11,10 @@ from test_ranges import cart
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.sets import splitting
 from simpel_cli.discovery.search.sets.splitting import two_in_place
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.verdict.verdict import _phrase
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression, Term
@@ -80,3 +85,37 @@ def test_a_rival_by_itself_is_no_half_of_a_pair(said: bool) -> None:
     )  # fmt: skip
     search, chosen = chosen_in(0.05, other)
     assert names(two_in_place(search, chosen, 0)) == [["coulomb", "load"]]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        ([], "drag on v (c = 2 (1..3) 1/m)"),
+        ([("coulomb_friction", "load")], " (which these data cannot tell from coulomb friction on v with load on v)"),
+        (
+            [("coulomb", "load"), ("coulomb", "offset")],
+            " (which these data cannot tell from coulomb on v with load on v, or from coulomb on v with offset on v)",
+        ),
+    ],
+)
+def test_pairs_are_said_in_the_sentence(pairs: list[tuple[str, str]], said: str) -> None:
+    effect = {
+        "name": "drag", "acts_on": "v", "class_members": [{"name": "drag", "acts_on": "v", "same": True}],
+        "parameters": {"c": {"value": 2.0, "low": 1.0, "high": 3.0, "unit": "1/m"}},
+        "same_as_two": [[{"name": name, "acts_on": "v"} for name in pair] for pair in pairs],
+    }  # fmt: skip
+    assert _phrase(effect).endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "alike", "better"), [(-4, False, False), (-2, True, False), (2, True, True), (9, False, True)]
+)
+def test_a_pair_is_as_good_on_both_sides_and_a_half_on_one(ahead: float, alike: bool, better: bool) -> None:
+    whole: Any = SimpleNamespace(log_evidence=0.0, loss=0.0, free=(0,))
+    fit: Any = SimpleNamespace(log_evidence=float(ahead), loss=5.0, free=(0, 1))
+    assert unwrap(splitting._as_good)(fit, whole) is alike
+    assert unwrap(splitting._better)(fit, whole) is better
+    fit.loss = 0.5  # widths of priors alone tell no two apart, unless one of them has more unknowns
+    assert unwrap(splitting._as_good)(fit, whole) is alike
+    fit.free = (1,)
+    assert unwrap(splitting._as_good)(fit, whole)

@@ -91,4 +91,5 @@ def _as_good(fit: Optimum, whole: Optimum) -> bool:
 
 
 def _better(fit: Optimum, whole: Optimum) -> bool:
+    """Whether a model is ahead, by however much: a half that does better by itself needs no other."""
     return fit.log_evidence > whole.log_evidence
