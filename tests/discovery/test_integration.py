@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from command_line import process
 from test_ranges import cart
 from test_wide_ranges_of_a_run import SIM
 
+from simpel_cli.config.build import build
+from simpel_cli.config.folders import conf_dir
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search import integration
 from simpel_cli.discovery.search.integration import LOST, MOST, Finer, _missed, too_coarse
@@ -26,6 +29,7 @@ DRY = Expression(
                 "w": {"range": [0.01, 0.1], "neutral": 0.05, "unit": "m/s"}},
 )  # fmt: skip
 DRAG = Expression("drag", acts_on="v", term="-k*v", parameters={"k": {"range": [0, 2], "unit": "1/s", "starts": [0.5]}})
+LATE = build(yaml.safe_load((conf_dir() / "effect" / "input_delay.yaml").read_text()), "effect")
 DATA = "path: run.parquet\ntime: t\nepisode: episode\nsplit: {test_fraction: 0.25, by: episode}\n"
 FINE = 500  # steps of the truth, a row
 
@@ -93,11 +97,11 @@ def test_more_steps_miss_less_and_steps_that_run_away_miss_everything(
     moved = integration._moved
 
     def lost(*given: Any) -> np.ndarray:
-        return moved(*given) * (np.nan if given[-1] == 1 else 1.0)
+        return moved(*given) * (np.nan if given[3].shape[1] == 1 else 1.0)  # one step a row
 
     monkeypatch.setattr(integration, "_moved", lost)
     rows = (search.plan.windows.ok[:, 1:] > 0).any(axis=2).sum()
-    everything = rows * len(search.plan.augmented.driven) * 0.5 * np.log1p(LOST)
+    everything = rows * len(search.plan.augmented.measured) * 0.5 * np.log1p(LOST)
     assert _missed(search, assessor, chosen, 1) == pytest.approx(everything)
 
 
@@ -122,6 +126,37 @@ def test_a_row_is_as_long_as_its_clock_says(rubbing: Recording, monkeypatch: pyt
     np.testing.assert_allclose(uneven, dt * np.tile(pace[:-1], len(windows.episode)))
 
 
+def delayed(delay: float, every: int) -> Recording:
+    """Carts whose input changes every so many rows and arrives late, exactly integrated."""
+    random = np.random.default_rng(2)
+    episodes = []
+    for e in range(4):
+        u = np.repeat(random.uniform(-3, 3, 60 // every), every)
+        x = np.zeros((60, 2))
+        for i in range(59):
+            (s, v), before, now = x[i], 1.2 * u[max(i - 1, 0)], 1.2 * u[i]
+            v_there = v + before * delay
+            s_there, rest = s + v * delay + before * delay**2 / 2, 0.1 - delay
+            x[i + 1] = s_there + v_there * rest + now * rest**2 / 2, v_there + now * rest
+        noisy = x + 1e-4 * random.normal(size=x.shape)
+        episodes.append(Episode(str(e), np.arange(60) * 0.1, noisy, u[:, None], np.zeros((60, 0))))
+    std = {"s": 1e-4, "v": 1e-4}
+    return Recording(tuple(episodes[:3]), tuple(episodes[3:]), (), std, (), (Check("c", True, ""),), ())
+
+
+def test_an_input_that_arrives_within_a_row_asks_for_more_steps() -> None:
+    recording = delayed(0.03, every=2)
+    finer, *_, coarse = asked(recording, LATE)
+    assert finer == Finer()
+    again, *_, better = asked(recording, LATE, MOST)
+    assert again is None
+    assert better.optimum.log_evidence > coarse.optimum.log_evidence + ACCEPT
+
+
+def test_an_input_that_arrives_with_a_row_asks_for_none() -> None:
+    assert asked(delayed(0.0999, every=2), LATE)[0] is None
+
+
 def test_no_more_steps_are_asked_for_where_sensors_would_not_show_it() -> None:
     assert asked(measured(0.3, dry=1.0), DRY)[0] is None
 
@@ -130,11 +165,11 @@ def test_a_smooth_effect_asks_for_none() -> None:
     assert asked(measured(1e-3, drag=0.5), DRAG)[0] is None
 
 
-@pytest.mark.parametrize("noise", [1e-3, 1e-5])
-def test_a_stiff_smooth_effect_asks_for_a_few(noise: float) -> None:
+@pytest.mark.parametrize(("noise", "steps"), [(1e-3, 2), (1e-5, 4)])
+def test_a_stiff_smooth_effect_asks_for_a_few(noise: float, steps: int) -> None:
     stiff = {"k": {"range": [0, 20], "unit": "1/s", "starts": [5.0]}}
     drag = Expression("drag", acts_on="v", term="-k*v", parameters=stiff)
-    assert asked(measured(noise, drag=8.0), drag)[0] == Finer(steps=2)
+    assert asked(measured(noise, drag=8.0), drag)[0] == Finer(steps=steps)
 
 
 def test_steps_are_not_asked_for_without_end(rubbing: Recording) -> None:

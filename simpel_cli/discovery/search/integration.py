@@ -1,12 +1,13 @@
 """How many integration steps a row the effects of a model need.
 
-A search takes as many as the simulator alone needs. A dry friction switches and a stop begins to push inside a row: what a
-step misses there is no noise, and with quiet sensors it is worth tens of nats, which another effect, or one more, earns that
-only makes up for the integrator. What is missed in a row counts as it shifts what the filter is sure of,
+A search takes as many as the simulator alone needs. A dry friction switches, a stop begins to push and a late input arrives
+inside a row: what a step misses there is no noise, and with quiet sensors it is worth tens of nats, which another effect, or
+one more, earns that only makes up for the integrator. What is missed in a row counts as it shifts what the filter is sure of,
 
     1/2 sum_i log(1 + m_i^2 / P_ii),    m = state one row later with n steps less the same with very many, P as predicted there,
 
-what a row loses to noise of the process that makes up for it, summed over the rows that are searched in.
+what a row loses to noise of the process that makes up for it, summed over the rows that are searched in. No noise of the
+process acts on a position: there it is what a sensor shows of it, and P is the variance of its innovation.
 
 Reference: Hairer, Norsett and Wanner (1993), Solving ordinary differential equations I, II.6 (jumps of the right-hand side);
 Kullback and Leibler (1951) for the shift of a Gaussian, in nats.
@@ -15,13 +16,16 @@ Kullback and Leibler (1951) for the shift of a Gaussian, in nats.
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from simpel_cli.discovery.search.again import Earlier
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.arriving import arriving_inputs, moving_of
 from simpel_cli.filtering.likelihood.augmented import Augmented
+from simulators.effects.term import ON_INPUT
 
 MOST = 8  # steps a row, at which one that switches is integrated as well as it will be
 NOTHING = 0.1  # of what an effect has to earn: what is missed then is left
@@ -86,12 +90,16 @@ def _missed(search: Search, assessor: Assessor, trial: Trial, steps: int) -> flo
         return 0.0
     kept = there[np.unique(np.linspace(0, len(there) - 1, min(ROWS, len(there))).astype(int))]
     w, k = kept.T
-    x, u = np.asarray(track.mean)[w, k], windows.u[w, windows.lead + k, : len(plan.augmented.model.inputs)]
-    p = np.asarray(plan.coordinates.physical(jnp.asarray(trial.optimum.z))[0])
+    x, (p, noise) = np.asarray(track.mean)[w, k], plan.coordinates.physical(jnp.asarray(trial.optimum.z))
+    at = np.asarray(p)
     row = plan.augmented.model.dt * (windows.clock[w, k, 0] if plan.clocked else np.ones(len(w)))
-    driven = list(plan.augmented.driven)
-    sure = np.asarray(track.predicted_cov)[w, k + 1][:, driven, driven]
-    finest, coarse = (_moved(plan.augmented, p, x, u, row, n)[:, driven] for n in (VERY_MANY, steps))
+    names, measured, driven = plan.augmented.model.states, plan.augmented.measured, plan.augmented.driven
+    looked = [i for i, q in enumerate(names) if i in driven or q.name in measured]
+    shown = [0.0 if i in driven else noise.r[measured.index(names[i].name)] ** 2 for i in looked]
+    sure = np.asarray(track.predicted_cov)[w, k + 1][:, looked, looked] + np.asarray(shown)
+    finest, coarse = (
+        _moved(plan.augmented, at, x, _arriving(search, at, n)[w, k], row)[:, looked] for n in (VERY_MANY, steps)
+    )
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         shift = np.where(coarse == finest, 0.0, (coarse - finest) ** 2 / sure)
     shift = np.minimum(np.nan_to_num(shift, nan=LOST, posinf=LOST), LOST)  # steps that run away miss everything
@@ -99,29 +107,43 @@ def _missed(search: Search, assessor: Assessor, trial: Trial, steps: int) -> flo
     return float(0.5 * np.log1p(shift[counts]).sum() * len(there) / max(counts.sum(), 1))
 
 
-def _moved(
-    augmented: Augmented, p: np.ndarray, x: np.ndarray, u: np.ndarray, row: np.ndarray, steps: int
-) -> np.ndarray:
+def _arriving(search: Search, p: np.ndarray, steps: int) -> np.ndarray:
+    """Return what acts in so many steps of every row of every window, (W, T, steps, K, nu).
+
+    K is 3, beginning, middle and end of a step, where inputs are not held between rows; else 1.
+    """
+    windows, augmented = search.plan.windows, search.plan.augmented
+    u = windows.u[:, :, : len(augmented.model.inputs)]
+    late = [p[row] for kind in ON_INPUT for _, row in augmented.operators[kind]]
+    if not (any(late) or any(augmented.own_delay) or any(augmented.own_lag) or moving_of(augmented)):
+        now = u[:, windows.lead :, None, None]
+        return np.broadcast_to(now, (*now.shape[:2], steps, *now.shape[3:]))
+    arriving = search.once(("arriving", steps), lambda: jax.jit(arriving_inputs(augmented, steps, windows.lead)))
+    every = jnp.broadcast_to(jnp.asarray(p)[:, None], (len(p), len(u)))
+    return np.moveaxis(np.asarray(arriving(every, jnp.moveaxis(jnp.asarray(u), 0, -1))), -1, 0)
+
+
+def _moved(augmented: Augmented, p: np.ndarray, x: np.ndarray, u: np.ndarray, row: np.ndarray) -> np.ndarray:
     """Return states (N, nx) one row later, by the classical method of Runge and Kutta.
 
     Args:
         augmented: the model.
         p: (dp,) its parameters.
         x: (N, nx) states.
-        u: (N, nu) inputs, which are held here: when one arrives within the row does not matter.
+        u: (N, steps, K, nu) inputs, K = 1 held over a step, 3 at its beginning, middle and end.
         row: (N,) how long the row is, s.
-        steps: that it is cut into.
     """
-    h, now = row / steps, x.T
-    inputs, everywhere = u.T, augmented.function.map("everywhere", "serial", len(x), [2], [])  # one p for all points
+    h, now = row / u.shape[1], x.T
+    everywhere = augmented.function.map("everywhere", "serial", len(x), [2], [])  # one p for all points
 
-    def rate(at: np.ndarray) -> np.ndarray:
-        return np.asarray(everywhere(at, inputs, p)[0])
+    def rate(at: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        return np.asarray(everywhere(at, inputs.T, p)[0])
 
     with np.errstate(invalid="ignore", over="ignore"):
-        for _ in range(steps):
-            one = rate(now)
-            two = rate(now + h / 2 * one)
-            three = rate(now + h / 2 * two)
-            now = now + h / 6 * (one + 2 * two + 2 * three + rate(now + h * three))
+        for step in np.moveaxis(u, 1, 0):
+            begin, middle, end = (step[:, i] for i in (0, step.shape[1] // 2, -1))
+            one = rate(now, begin)
+            two = rate(now + h / 2 * one, middle)
+            three = rate(now + h / 2 * two, middle)
+            now = now + h / 6 * (one + 2 * two + 2 * three + rate(now + h * three, end))
     return now.T

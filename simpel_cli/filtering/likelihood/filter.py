@@ -26,9 +26,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from simpel_cli.dynamics.between_rows import WAY, beyond
-from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.dynamics.integrate import at_stages
+from simpel_cli.filtering.likelihood.arriving import arriving_inputs, moving_of, per_signal
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import at_row, early_of, pace_of
 from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
@@ -39,7 +38,7 @@ from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, moving, n
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
-from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT, SENSOR_DELAY, SENSOR_LAG
+from simulators.effects.term import ON_INPUT, SENSOR_DELAY, SENSOR_LAG
 
 _KEPT: OrderedDict[tuple, Filter] = OrderedDict()
 MOST_KEPT = (
@@ -78,18 +77,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     plain_rates = _of_inputs(value(augmented, RATES), nu)
     periodic = {q.name for q in model.states if q.periodic}
     wraps = [name in periodic for name in augmented.measured]
-    delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
-    slow = augmented.operators[RATE_LIMIT]
-    # where it is asked what an input does between rows, the way from held over linear to smooth says so
-    linear = tuple(sorted({*model.linear, *(signal for signal, _ in shares)}))
-    said = tuple(WAY[word] for word in model.words_between_rows)
+    linear = moving_of(augmented)
     sensor_delays, sensor_lags = (augmented.operators[kind] for kind in (SENSOR_DELAY, SENSOR_LAG))
 
-    def per_signal(p: Array, rows: tuple[tuple[int, int], ...], size: int, own: tuple[float, ...] = ()) -> Array:
-        values = [jnp.full(p.shape[1:], own[i] if own else 0.0, p.dtype) for i in range(size)]
-        for signal, row in rows:
-            values[signal] = values[signal] + p[row]
-        return jnp.stack(values) if values else jnp.zeros((0, *p.shape[1:]), p.dtype)
+    late_inputs = arriving_inputs(augmented, substeps, lead)
 
     def inputs(p: Array, u: Array) -> Array:
         """Return the inputs of every substep, and behind them what stands behind the inputs of a row."""
@@ -98,23 +89,6 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             return arriving
         clock = u[lead:, None, None, nu:]
         return jnp.concatenate([arriving, jnp.broadcast_to(clock, (*arriving.shape[:3], *clock.shape[3:]))], axis=3)
-
-    def late_inputs(p: Array, u: Array) -> Array:
-        times = per_signal(p, delays, nu, augmented.own_delay), per_signal(p, lags, nu, augmented.own_lag)
-        more = {"half_play": per_signal(p, plays, nu)} if plays else {}
-        if slow:
-            more["slowness"] = per_signal(p, slow, nu)
-        if shares:
-            more["way"] = per_signal(p, shares, nu, said)
-        if linear:  # nothing is predicted from the last row of a window, but a smooth input reads beyond it before
-            u = jnp.concatenate([u, beyond(u)[None] if shares or model.smooth else u[-1:]])
-
-        def one(u: Array, delay: Array, lag: Array, more: dict[str, Array]) -> Array:
-            return delayed_inputs(
-                u, delay, lag, dt=dt, substeps=substeps, lead=lead, linear=linear, smooth=model.smooth, **more
-            )
-
-        return _over_points(one, p.ndim - 1)(u, *times, more)
 
     # four stages in a scan, inside the scan of the substeps: the expressions are compiled once
     stages = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
@@ -305,9 +279,3 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 def _of_inputs(function: Any, nu: int) -> Any:
     """Take what stands behind the inputs away from a function of (x, u, ...)."""
     return lambda x, u, *given: function(x, u[:nu], *given)
-
-
-def _over_points(function: Callable[..., Array], extra: int) -> Callable[..., Array]:
-    for _ in range(extra):
-        function = jax.vmap(function, in_axes=-1, out_axes=-1)
-    return function
