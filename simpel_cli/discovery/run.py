@@ -33,7 +33,7 @@ from simpel_cli.discovery.verdict.groups import sentence_of as of_groups
 from simpel_cli.discovery.verdict.remainder import remainder_of
 from simpel_cli.discovery.verdict.undetectable import caveats, undetectable
 from simpel_cli.discovery.verdict.verdict import AMBIGUOUS, steps_of, verdict_of
-from simpel_cli.errors import ConfigError, DataError, Inconclusive
+from simpel_cli.errors import ConfigError, Inconclusive, SimpelError
 from simpel_cli.filtering.errors_ahead import Assessment
 from simpel_cli.runs.console import Terminal
 from simpel_cli.runs.files import strict as strict_json
@@ -218,9 +218,16 @@ def _correct(
     if hidden:
         added["not_closed"] = f"{NOT_ALIKE}: simpel fit --config-dir {directory.name}/conf sim={name} data={data.stem}"
     elif config.get("close", True) and (len(nowhere) < changes or len(left_out) < len(found["effects"])):
-        try:
-            added["as_prior"] = close(declared, after, directory, data_folder, terminal)
-        except DataError as error:  # a fit needs whole rows; what was found stands without it
-            terminal.line(f"no fit with the corrected simulator: {error}", "close")
-            added["not_closed"] = str(error)
+        added |= _compared(declared, after, directory, data_folder, terminal)
     return added
+
+
+def _compared(
+    declared: Declared, after: Declared, directory: Path, data_folder: Path, terminal: Terminal
+) -> dict[str, Any]:
+    """Compare both simulators as priors; what was found stands without it: a fit needs whole rows, and can fail."""
+    try:
+        return {"as_prior": close(declared, after, directory, data_folder, terminal)}
+    except SimpelError as error:
+        terminal.line(f"no fit with the corrected simulator: {error}", "close")
+        return {"not_closed": str(error)}

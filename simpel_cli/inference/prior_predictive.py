@@ -63,10 +63,19 @@ class OutputCheck(NamedTuple):
 
 
 class PriorCheck(NamedTuple):
-    """Checks of all targets, and the table of `prior_predictive.parquet`."""
+    """Checks of all targets, and the table of `prior_predictive.parquet`.
+
+    Args:
+        outputs: check of every target.
+        table: of the draws and the measured targets.
+        lost: of how many draws the integration ran away.
+        draws: that were made.
+    """
 
     outputs: tuple[OutputCheck, ...]
     table: dict[str, list[float] | list[str]]
+    lost: int = 0
+    draws: int = 0
 
 
 def check_prior(
@@ -100,7 +109,11 @@ def check_prior(
     rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), MOST_ROWS)).round().astype(int))
     x, y = x[rows], y[rows]
     y_mean, y_std = np.asarray(normaliser.y_mean, float), np.asarray(normaliser.y_std, float)
-    drawn = system.simulate(key, x, DRAWS) if bank is None else np.moveaxis(np.asarray(bank.samples)[rows], -1, 0)
+    drawn, lost = (
+        system.simulate_and_count(key, x, DRAWS)
+        if bank is None
+        else (np.moveaxis(np.asarray(bank.samples)[rows], -1, 0), 0)
+    )
     if 1 / (1 + len(drawn) // 2) > SURPRISING:
         return None
     samples, targets = (drawn - y_mean) / y_std, (y - y_mean) / y_std  # (N, m, dy), (m, dy)
@@ -130,7 +143,7 @@ def check_prior(
             "outside": outside,
         }.items():
             table.setdefault(column, []).extend(np.asarray(values).tolist())
-    return PriorCheck(tuple(checks), table)
+    return PriorCheck(tuple(checks), table, lost, len(drawn))
 
 
 def measurement_noise(

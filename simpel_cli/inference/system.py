@@ -17,7 +17,14 @@ from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import Transition, encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.protocols import Normaliser
-from simpel_cli.priors.function_prior import SimulatorPrior, sample_parameters
+from simpel_cli.priors.function_prior import (
+    MOST_CHANGE,
+    SimulatorPrior,
+    followed,
+    instead_of_lost,
+    reach_of,
+    sample_parameters,
+)
 from simulators.model import Model
 from simulators.parameters import draw
 from simulators.worlds.world import World
@@ -25,7 +32,7 @@ from simulators.worlds.world import World
 NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
 WORLD_POINTS, WORLD_DRAWS = 200, 16  # of the normaliser, where a query costs a simulation and not a microsecond
 DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
-MOST_CHANGE = 100.0  # times the declared range of a state, in one transition
+MOST_LOST = 0.05  # share of the draws that may run away: more are no tails of a law, but a simulator that fails
 
 
 class System(NamedTuple):
@@ -49,16 +56,35 @@ class System(NamedTuple):
         Raises:
             ConfigError: a simulator returned something that is not finite; names state, input and parameters.
         """
+        return self.simulate_and_count(key, x, n)[0]
+
+    def simulate_and_count(self, key: PRNGKeyArray, x: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """Return the same, and of how many draws the integration ran away, for which others stand.
+
+        A law without ends has such draws in its tails.
+        """
         if self.transition is not None:
             prior = SimulatorPrior(gap=None).bind(self.transition, *self.dims, np.ones(self.encoding.dim_x))
-            values = np.asarray(jax.jit(prior.simulate, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
-            if not np.isfinite(values).all():
+            values = np.asarray(jax.jit(prior.run, static_argnums=2)(key, jnp.asarray(x, jnp.float64), n))
+            lost = self._lost(values)
+            if lost is None:
                 # the same key draws the same parameters again
                 phi = np.asarray(sample_parameters(key, self.transition.params, n, jnp.dtype(jnp.float64)))
                 raise divergence_error(self.source, self.encoding, x, phi, values)
-            return values
-        assert not isinstance(self.source, Model)
-        return query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
+        else:
+            assert not isinstance(self.source, Model)
+            values, phi, after = query(self.source, self.encoding, x, n, int(jax.random.bits(key)))
+            lost = self._lost(values)
+            if lost is None:
+                raise divergence_error(self.source, self.encoding, x, phi, after)
+        return np.asarray(instead_of_lost(values, reach_of(self.encoding))) if lost else values, lost
+
+    def _lost(self, values: np.ndarray) -> int | None:
+        """Return how many draws (n, M, dy) ran away; None: too many, and not all values are finite."""
+        lost = len(values) - int(followed(values, reach_of(self.encoding)).sum())
+        if lost <= MOST_LOST * len(values):
+            return lost
+        return 0 if np.isfinite(values).all() else None
 
     @property
     def dims(self) -> tuple[int, int]:
@@ -75,21 +101,21 @@ def system_of(source: Model | World, outputs: tuple[str, ...], stack: int) -> Sy
     return System(source, encoding, Domain(encoding), step)
 
 
-def query(world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int) -> np.ndarray:
-    """Run n parameter draws of a world at every input (M, dx); returns targets (n, M, dy).
+def query(
+    world: World, encoding: Encoding, x: np.ndarray, n: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Run n parameter draws of a world at every input (M, dx).
 
-    Raises:
-        ConfigError: the world returned something that is not finite; names state, input and parameters.
+    Returns:
+        Targets (n, M, dy), parameters (n, dp), and states one transition later (n, M, ds).
     """
     states, stacked = encoding.split_x(x)
     inputs = encoding.inputs_now(stacked)
     phi = draw(world.params, np.random.default_rng(seed), n)
     m = len(x)
     after = world.step(np.tile(states, (n, 1)), np.tile(inputs, (n, 1)), np.repeat(phi, m, axis=0))
-    if not np.isfinite(after).all():
-        raise divergence_error(world, encoding, x, phi, after.reshape(n, m, -1))
     targets = encoding.to_y(np.tile(states, (n, 1)), after, np.zeros((n * m, 0)))
-    return targets.reshape(n, m, -1)
+    return targets.reshape(n, m, -1), phi, after.reshape(n, m, -1)
 
 
 def normaliser_of(system: System, key: PRNGKeyArray) -> Normaliser:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import OneStep, Transition
 from simpel_cli.errors import ConfigError
 from simpel_cli.priors.gaussian_process import Kernel, SquaredExponential, gram
@@ -23,6 +24,7 @@ from simulators.model import Quantity
 
 WIDE = 64  # numbers in a transition
 CACHED = 2**16  # numbers: a quarter of a megabyte in float32
+MOST_CHANGE = 100.0  # times the declared range of a state, in one transition: what goes further has run away
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class FunctionPrior(NamedTuple):
         step: the simulator's one-step map; None: no simulator part (zero).
         width: numbers that the integration of one transition carries.
         dim_y: number of outputs.
+        reach: (dy,) how far an output can be in a draw whose integration did not run away; inf: it has to be finite.
     """
 
     draws: int
@@ -78,6 +81,7 @@ class FunctionPrior(NamedTuple):
     step: OneStep | None
     width: int
     dim_y: int
+    reach: np.ndarray | float = np.inf
 
     @property
     def simulates(self) -> bool:
@@ -85,7 +89,14 @@ class FunctionPrior(NamedTuple):
         return self.step is not None
 
     def simulate(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
-        """Draw n parameter vectors and run the simulator of each at every input (data units)."""
+        """Draw n parameter vectors and run the simulator of each at every input (data units).
+
+        Of a law without ends a few draws are out of what the integration follows: others take their place.
+        """
+        return instead_of_lost(self.run(key, x, n), self.reach)
+
+    def run(self, key: PRNGKeyArray, x: Float[Array, "M dx"], n: int) -> Float[Array, "n M dy"]:
+        """Return the same with every draw as it came out, which of some may not be finite."""
         if self.step is None:
             return jnp.zeros((n, x.shape[0], self.dim_y), x.dtype)
         phi = sample_parameters(key, self.params, n, x.dtype)
@@ -145,7 +156,8 @@ class SimulatorPrior:
         step, params, width = (system.step, system.params, system.width) if system is not None else (None, (), 0)
         kernel = self.gap.kernel if self.gap is not None else None
         input_scale = _input_scale(self.gap, x_std) if self.gap is not None else np.ones(dim_x)
-        return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, width, dim_y)
+        reach = reach_of(system.encoding) if system is not None else np.inf
+        return FunctionPrior(self.draws, self.white_variance, kernel, input_scale, params, step, width, dim_y, reach)
 
 
 @dataclass(frozen=True)
@@ -187,6 +199,26 @@ class GPPrior:
         return FunctionPrior(
             self.draws, self.white_variance, self.kernel, _input_scale(self.gap, x_std), (), None, 0, dim_y
         )
+
+
+def reach_of(encoding: Encoding) -> np.ndarray:
+    """Return how far every target can be, data units (dy,); an output that has no range and an angle can be anywhere."""
+    ranges = {q.name: MOST_CHANGE * (q.high - q.low) for q in encoding.states if not q.periodic}
+    return encoding.per_target(ranges, np.inf)
+
+
+def followed(draws: Array | np.ndarray, reach: np.ndarray | float) -> Array:
+    """Return which draws (n, M, dy) the integration followed, (n,): finite, and within reach, everywhere."""
+    most = jnp.minimum(jnp.asarray(reach, draws.dtype), jnp.finfo(draws.dtype).max)
+    return jnp.all(jnp.abs(jnp.asarray(draws)) <= jnp.reshape(most, (1, 1, -1)), axis=(1, 2))
+
+
+def instead_of_lost(draws: Array | np.ndarray, reach: np.ndarray | float) -> Array:
+    """Return draws (n, M, dy) with those that the integration followed in place of the others, one after the other."""
+    draws = jnp.asarray(draws)
+    good = followed(draws, reach)
+    order = jnp.argsort(~good, stable=True)[jnp.arange(len(draws)) % jnp.maximum(good.sum(), 1)]
+    return jnp.where(good[:, None, None], draws, draws[order])
 
 
 def _input_scale(gap: GapGP, x_std: Float[Array | np.ndarray, " dx"]) -> Float[Array | np.ndarray, " dx"]:

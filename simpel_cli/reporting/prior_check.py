@@ -5,7 +5,13 @@ from simpel_cli.runs.console import Terminal
 
 
 def describe_prior(terminal: Terminal, checked: PriorCheck) -> None:
-    """Print which targets the prior does not explain, and what to do."""
+    """Print which targets the prior does not explain, and what to do; and that draws ran away."""
+    if checked.lost:
+        terminal.line(
+            f"the integration of {checked.lost} of {checked.draws} draws of the simulator runs away: others stand for them "
+            "(raise sim.substeps, or narrow sim.parameters)",
+            "prior",
+        )
     lost = [o for o in checked.outputs if not o.explained]
     by_gap = [o for o in checked.outputs if o.explained and not o.by_simulator]
     if not lost and not by_gap:

@@ -1,5 +1,6 @@
 """The corrected YAML against the model that the search fitted: the same rates and readings at random points."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,11 +12,15 @@ from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
 from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery import run as discovery_run
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict import corrected as module
+from simpel_cli.errors import NumericsError
 from simpel_cli.filtering.likelihood.augmented import augment
 from simpel_cli.filtering.likelihood.fit import Optimum
 from simpel_cli.filtering.setup import terms_of
+from simpel_cli.runs.console import Terminal
+from simpel_cli.studies.declared import Declared
 from simulators.effects import Scales, Term
 from simulators.model import Model
 
@@ -232,3 +237,33 @@ def test_an_input_that_is_late_already_gets_no_second_delay() -> None:
     lags = {("input_lag", "steer"), ("input_lag", "throttle")}
     assert places(prompt) == lags | {("input_delay", "steer"), ("input_delay", "throttle")}
     assert places(late) == lags
+
+
+def test_a_prior_of_what_cannot_be_negative_has_no_negative_tail() -> None:
+    """The mean and the standard deviation are those of the estimate, whichever law has them."""
+    for low, high in ((5.1, 31.8), (0.0, 3.0), (4e-4, 3.3e-3)):
+        law = module.law_of(low, high, signed=False, log=False)
+        assert law["prior"] == "lognormal"
+        ends = np.log(law["range"])
+        mean = np.exp(ends.mean() + (s2 := (np.diff(ends)[0] / 4) ** 2) / 2)
+        assert mean == pytest.approx((low + high) / 2)
+        assert mean * np.sqrt(np.expm1(s2)) == pytest.approx((high - low) / 4)
+    normal = {"prior": "normal"}
+    assert module.law_of(9.0, 11.0, signed=False, log=False) == normal | {"range": [9.0, 11.0]}
+    assert module.law_of(-1.0, 3.0, signed=True, log=False) == normal | {"range": [-1.0, 3.0]}
+    # what was estimated in its logarithm is normal there
+    assert module.law_of(0.1, 9.0, signed=False, log=True) == {"range": [0.1, 9.0], "prior": "lognormal"}
+
+
+def test_a_comparison_as_priors_that_fails_takes_nothing_from_what_was_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fails(*_: Any) -> None:
+        raise NumericsError("step 502: `loss` is not finite")
+
+    monkeypatch.setattr(discovery_run, "close", fails)
+    declared = Declared({}, {})
+    terminal = Terminal(True, tmp_path / "run.log")
+    found = discovery_run._compared(declared, declared, tmp_path, tmp_path, terminal)
+    assert found == {"not_closed": "step 502: `loss` is not finite"}
+    assert "no fit with the corrected simulator: step 502" in (tmp_path / "run.log").read_text()

@@ -18,7 +18,7 @@ from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales
 from simpel_cli.priors.marginal_likelihood import best_scales, noise_of_smooth, spectrum
 from simpel_cli.scores.gaussian import Gaussian
-from simulators.model import Declared, ModelError
+from simulators.model import Declared, Model, ModelError
 from simulators.worlds.callable_world import CallableWorld
 
 KEY = jax.random.key(0)
@@ -166,6 +166,30 @@ def test_a_declared_simulator_that_blows_up_is_named_with_a_point_that_does_it()
     one = system.transition.step(jnp.array([point["x"], point["u"]]), jnp.array([point["a"]]))
     assert not np.isfinite(one).all()
     assert "sqrt(max(h, 0)), raise sim.substeps" in str(e.value)
+
+
+def relaxing(high: float) -> Model:
+    """A simulator whose integration is stable for k < 27.8 1/s; 2.5 % of its draws lie above `high`."""
+    k = {"k": {"unit": "1/s", "range": [0.1, high], "prior": "lognormal"}}
+    return Declared("relaxing", DT, **VARIABLES | {"parameters": k}, dynamics={"x": "u - k*x"}).model()
+
+
+@pytest.mark.parametrize("k", ["model", "world"])
+def test_draws_in_the_tail_of_a_law_that_run_away_are_drawn_again(k: str):
+    model = relaxing(600.0)
+    source = model if k == "model" else world(lambda s, u, a: np.where(a > 1.495, np.nan, exact(s, u, a)))
+    system = system_of(source, (), 0)
+    x = np.array([[0.3, 0.5], [-0.7, 0.0]])
+    values, lost = system.simulate_and_count(KEY, x, 2000)
+    assert 0 < lost < 100
+    assert np.isfinite(values).all()
+    assert np.abs(values).max() < 300
+    assert len(np.unique(values[:, 0, 0])) == 2000 - lost
+
+
+def test_a_law_of_which_too_many_draws_run_away_is_refused():
+    with pytest.raises(ConfigError, match="relaxing is not finite"):
+        system_of(relaxing(1e300), (), 0).simulate(KEY, np.array([[0.3, 0.5]]), 2000)
 
 
 def test_training_inputs_at_which_the_simulator_blows_up_are_named_too():

@@ -9,7 +9,14 @@ from systems import model
 
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior, sample_parameters
+from simpel_cli.priors.function_prior import (
+    GapGP,
+    GPPrior,
+    SimulatorPrior,
+    followed,
+    instead_of_lost,
+    sample_parameters,
+)
 from simpel_cli.priors.gaussian_process import Matern32
 from simulators.model import Quantity
 
@@ -63,6 +70,18 @@ def test_simulator_part_is_the_one_step_map_of_every_draw_at_every_input() -> No
     assert np.ptp(draws[:, 1, 2]) > 0.01  # draws differ
     np.testing.assert_array_equal(draws, prior.simulate(key, x, 5))
     assert np.any(draws != prior.simulate(jax.random.key(4), x, 5))
+
+
+def test_draws_that_ran_away_are_replaced_whole_and_the_others_stay() -> None:
+    draws = jnp.arange(24.0).reshape(6, 2, 2)
+    draws = draws.at[1, 0, 1].set(jnp.nan).at[2, 1, 0].set(-jnp.inf).at[4, 0, 0].set(300.0)
+    reach = np.array([100.0, np.inf])
+    np.testing.assert_array_equal(followed(draws, reach), [True, False, False, True, False, True])
+    kept = instead_of_lost(draws, reach)
+    np.testing.assert_array_equal(kept[np.array([0, 3, 5])], draws[np.array([0, 3, 5])])
+    np.testing.assert_array_equal(kept[np.array([1, 2, 4])], draws[np.array([3, 5, 3])])  # one after the other
+    lost = jnp.full((3, 1, 2), jnp.nan)
+    assert np.isnan(instead_of_lost(lost, reach)).all()  # nothing to put there
 
 
 def test_covariance_of_the_gap() -> None:

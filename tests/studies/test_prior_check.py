@@ -35,6 +35,12 @@ def test_what_only_the_gap_explains_and_what_nothing_does(tmp_path: Path) -> Non
     assert "method=simpel" not in text
 
 
+def test_draws_that_run_away_are_counted(tmp_path: Path) -> None:
+    assert "runs away" not in said(tmp_path, FINE)
+    describe_prior(Terminal(True, tmp_path / "run.log"), PriorCheck((FINE,), {}, 3, 2048))
+    assert "the integration of 3 of 2048 draws of the simulator runs away" in (tmp_path / "run.log").read_text()
+
+
 @pytest.mark.parametrize("outside", [0, 2])
 def test_without_a_gap_a_simulator_that_does_not_explain_the_data_is_told_to_take_one(
     tmp_path: Path, outside: int

@@ -5,11 +5,13 @@ import re
 from typing import Any
 
 import casadi
+import numpy as np
 
 from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.verdict.groups import differing, spread_of
 from simpel_cli.discovery.verdict.verdict import Z95, interval_of
+from simpel_cli.filtering.likelihood.coordinates import LOG_UNIFORM
 from simulators.effects import Term
 from simulators.effects.term import BACKLASH, DELAY, LAG, ON_SENSOR, RATE_LIMIT, SENSOR, SENSOR_DELAY
 from simulators.model import Declared, Model, ModelError
@@ -17,6 +19,7 @@ from simulators.quantity import HIDDEN, READING
 from simulators.readings import line_of
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
+SURELY = 6.0  # standard deviations from zero beyond which a normal prior has one sign
 STIFF = 8  # Runge-Kutta steps per row: groups at the far end of a population move faster than any that was seen
 NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
 PAST = {
@@ -30,9 +33,8 @@ FOLLOWS = "a lagging reading follows what it reads by a law of its own, to which
 def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -> tuple[str, dict[str, Any], list[str]]:
     """Return name, YAML and what could not be written, each with the reason.
 
-    Priors of the effects' parameters are normal, with the 95 % interval of the fit for range, and likewise the spread of
-    one that differs from group to group; the simulator's own
-    keep the ranges that the user declared.
+    Priors of the effects' parameters are normal, with the 95 % interval of the fit for range, or lognormal (see `law_of`), and
+    likewise the spread of one that differs from group to group; the simulator's own keep the ranges that the user declared.
 
     Args:
         sim: the `sim:` node, as declared.
@@ -79,9 +81,10 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             names[parameter.name] = short
             span = interval_of(search, trial, row, Z95)
             low, high = sorted((span["low"], span["high"]))
-            parameters[short] = (
-                {"unit": parameter.unit, "range": [low, high], "prior": "normal"} if low < high else span["value"]
-            )
+            parameters[short] = span["value"]
+            if low < high:
+                law = law_of(low, high, signed=parameter.low < 0, log=parameter.prior == LOG_UNIFORM)
+                parameters[short] = {"unit": parameter.unit} | law
             if row in spread and low < high:
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
@@ -91,6 +94,28 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     sensors = shown(written, names, model, search.plan.augmented.measured)
     node |= {"sensors": sensors} if sensors else {}
     return name, node, [f"{t.label} ({cannot[t]})" for t in terms if cannot[t]]
+
+
+def law_of(low: float, high: float, *, signed: bool, log: bool) -> dict[str, Any]:
+    """Return the prior of a parameter with a 95 % interval: normal, unless its tail would leave what an effect can be.
+
+    A lag, a delay or a stiffness below zero is no simulator, and some integrate to anything: there the prior is the lognormal
+    one of the same mean and standard deviation.
+
+    Args:
+        low: end of the interval.
+        high: the other.
+        signed: whether the parameter may be below zero.
+        log: whether its logarithm is what was estimated: the interval is that of a lognormal one.
+    """
+    middle, sd = (low + high) / 2, (high - low) / 4
+    if log and low > 0:
+        return {"range": [low, high], "prior": "lognormal"}
+    if signed or middle > SURELY * sd:
+        return {"range": [low, high], "prior": "normal"}
+    wide = np.sqrt(np.log1p((sd / middle) ** 2))
+    ends = middle * np.exp(-(wide**2) / 2 + np.array([-2.0, 2.0]) * wide)
+    return {"range": ends.tolist(), "prior": "lognormal"}
 
 
 def _extended(
