@@ -11,6 +11,7 @@ from simulators.quantity import (
     ModelError,
     Quantity,
     check_keys,
+    check_mapping,
     read_expression,
     read_number,
     read_range,
@@ -21,7 +22,7 @@ from simulators.quantity import (
 )
 
 INTERMEDIATE = ("unit", "expression")
-KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior", "per", "spread")  # of a parameter
+KNOWN, UNCERTAIN = ("unit", "value"), ("unit", "range", "prior", "per", "spread", "groups")  # of a parameter
 COVARIATE = ("unit", "range", "column")  # of one that is known in every row
 
 
@@ -121,16 +122,30 @@ def read_parameters(
     return tuple(uncertain), fixed, derived
 
 
-def read_groupings(nodes: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, tuple[float, float]]]:
-    """Read which uncertain parameters differ from group to group: the columns of the groups, and ranges of spreads."""
-    found, spreads = {}, {}
+def read_groupings(
+    nodes: Mapping[str, Any],
+) -> tuple[dict[str, str], dict[str, tuple[float, float]], dict[str, dict[str, tuple[float, float]]]]:
+    """Read which uncertain parameters differ from group to group.
+
+    Returns:
+        Parameter -> column of the groups, -> range of the spread, and -> group -> range of its value, where they are given.
+    """
+    found, spreads, known = {}, {}, {}
     for name, node in nodes.items():
+        for key in ("spread", "groups"):
+            if isinstance(node, Mapping) and key in node and "per" not in node:
+                raise ModelError(
+                    f"sim.parameters.{name}.{key}: only of a parameter that differs between groups; add `per: COLUMN`, or "
+                    "leave it out"
+                )
+        if isinstance(node, Mapping) and "groups" in node:
+            path = f"sim.parameters.{name}.groups"
+            check_mapping(path, node["groups"])
+            known[name] = {
+                str(group): read_range(f"{path}.{group}", {"range": ends}) for group, ends in node["groups"].items()
+            }
         if isinstance(node, Mapping) and "spread" in node:
             path = f"sim.parameters.{name}.spread"
-            if "per" not in node:
-                raise ModelError(
-                    f"{path}: only of a parameter that differs between groups; add `per: COLUMN`, or leave it out"
-                )
             low, high = read_range(path, {"range": node["spread"]})
             if low < 0:
                 raise ModelError(f"{path}: low = {low:g} is negative, and a standard deviation is not; give 0 or more")
@@ -141,7 +156,7 @@ def read_groupings(nodes: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, 
                     f"sim.parameters.{name}.per: {node['per']!r} is not the name of a column (letters, digits, underscores)"
                 )
             found[name] = node["per"]
-    return found, spreads
+    return found, spreads, known
 
 
 def read_covariates(nodes: Mapping[str, Any]) -> tuple[tuple[Quantity, ...], dict[str, str]]:

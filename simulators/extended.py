@@ -126,7 +126,7 @@ class Extended:
             added = {name: read_term(f"sim.dynamics.{name}", text, scope) for name, text in self.dynamics.items()}
             return column(base.symbol, [rates[i] + added.get(q.name, 0) for i, q in enumerate(base.states)])
 
-        per, spreads = read_groupings(self.parameters)
+        per, spreads, known_groups = read_groupings(self.parameters)
         late = {key: getattr(base, key) | read_times(key, self.inputs, params, base.fixed | fixed) for key in TIMES}
         model = replace(
             base,
@@ -137,6 +137,7 @@ class Extended:
             fixed=base.fixed | fixed,
             per=base.per | per,
             spreads=base.spreads | spreads,
+            known_groups=base.known_groups | known_groups,
             coordinates=None if self.dynamics or values else base.coordinates,
             between_rows=base.between_rows | read_between_rows(self.inputs),
             **late,

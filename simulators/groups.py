@@ -5,6 +5,7 @@
 c and the spread s are parameters of the population, delta_g of a group. Which group a row is of, is an input per group that is
 1 there and 0 elsewhere. The last of them is of a group that was never seen: no data tell of its delta, so that what is
 predicted for it is the population, with its spread. Parameters of a simulator and of an effect differ in the same way.
+A group of which the value itself is known, from other measurements, is no member of that population: its value is a parameter.
 
 Reference: Gelman and Hill (2007), Data analysis using regression and multilevel/hierarchical models, ch. 12 (partial pooling).
 """
@@ -40,6 +41,8 @@ class Grouping(NamedTuple):
         members: delta of every group; the last is of one that was never seen.
         slots: inputs that say which group a row is of, in the same order.
         names: of the groups, as the column has them, without that one.
+        known: value of every group of which it is known.
+        known_slots: inputs of these, in the same order.
     """
 
     parameter: str
@@ -49,11 +52,13 @@ class Grouping(NamedTuple):
     members: tuple[Quantity, ...]
     slots: tuple[str, ...]
     names: tuple[str, ...]
+    known: tuple[Quantity, ...] = ()
+    known_slots: tuple[str, ...] = ()
 
     @property
     def own(self) -> tuple[Quantity, ...]:
         """The parameters that the groups need beside the common one: the spread first."""
-        return (self.spread, *self.members)
+        return (self.spread, *self.members, *self.known)
 
     def value(self, known: Mapping[str, Symbol]) -> Symbol:
         """Return the parameter of the group that a row is of, from what all names stand for."""
@@ -61,10 +66,19 @@ class Grouping(NamedTuple):
             casadi.vertcat(*(known[slot] * known[q.name] for slot, q in zip(self.slots, self.members, strict=True)))
         )
         common = known[self.parameter]
-        return common * casadi.exp(off) if self.ratio else common + off
+        value = common * casadi.exp(off) if self.ratio else common + off
+        for slot, q in zip(self.known_slots, self.known, strict=True):
+            value = value + known[slot] * (known[q.name] - value)
+        return value
 
 
-def grouping(q: Quantity, by: str, names: tuple[str, ...], spread: tuple[float, float] | None = None) -> Grouping:
+def grouping(
+    q: Quantity,
+    by: str,
+    names: tuple[str, ...],
+    spread: tuple[float, float] | None = None,
+    known: Mapping[str, tuple[float, float]] | None = None,
+) -> Grouping:
     """Return how a parameter differs between groups.
 
     Args:
@@ -72,14 +86,26 @@ def grouping(q: Quantity, by: str, names: tuple[str, ...], spread: tuple[float, 
         by: column of the groups.
         names: of the groups.
         spread: range of the spread; None: from 0 to half of the range of the parameter.
+        known: group -> range of its value, +-2 standard deviations, of the logarithm where it is positive; None: of none.
     """
     ratio = is_factor(q)
     low, high = spread or (0.0, largest_spread(q))
-    members = tuple(
-        Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER) for word in words((*names, UNSEEN))
-    )
+    every, slots = (*names, UNSEEN), slot_names(by, names)
+    of_word = dict(zip(every, zip(words(every), slots, strict=True), strict=True))
+    given = {name: ends for name, ends in (known or {}).items() if name in names}
+    others = [name for name in every if name not in given]
+    members = tuple(Quantity(f"{q.name}_of_{of_word[n][0]}", "1", *DELTA, prior="normal", role=MEMBER) for n in others)
     own = Quantity(f"{q.name}_spread", "1" if ratio else q.unit, low, high, role=SPREAD)
-    return Grouping(q.name, by, ratio, own, members, slot_names(by, names), names)
+    values = tuple(
+        Quantity(
+            f"{q.name}_of_{of_word[n][0]}", q.unit, *ends, prior="lognormal" if ratio and ends[0] > 0 else "normal"
+        )
+        for n, ends in given.items()
+    )
+    return Grouping(
+        q.name, by, ratio, own, members, tuple(of_word[n][1] for n in others), tuple(others[:-1]),
+        values, tuple(of_word[n][1] for n in given),
+    )  # fmt: skip
 
 
 def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
@@ -101,9 +127,10 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
     inputs = [Quantity(name, "1", 0.0, 1.0) for name in slots]
     taken = {q.name for q in (*model.states, *model.inputs, *model.params, *model.outputs)} | model.fixed.keys()
     every = [
-        grouping(q, model.per[q.name], groups[model.per[q.name]], model.spreads.get(q.name))
+        grouping(q, by, groups[by], model.spreads.get(q.name), model.known_groups.get(q.name))
         for q in model.params
-        if q.name in model.per
+        for by in [model.per.get(q.name)]
+        if by is not None
     ]
     own = [q for each in every for q in each.own]
     for q in (*inputs, *own):
@@ -154,11 +181,12 @@ def refuse_late(model: Model, parameter: str, key: str) -> None:
 
 def spreads_of(params: Sequence[Quantity]) -> dict[int, list[int]]:
     """Return the rows of the spreads, and of what the groups are, without the group that was never seen."""
-    found = {}
+    found: dict[int, list[int]] = {}
     for i, q in enumerate(params):
         if q.role == SPREAD:
             after = [k for k in range(i + 1, len(params)) if params[k].role != MEMBER]
-            found[i] = list(range(i + 1, min(after, default=len(params)) - 1))
+            rows = list(range(i + 1, min(after, default=len(params)) - 1))
+            found |= {i: rows} if rows else {}  # the data tell nothing of the spread of groups that are all known
     return found
 
 

@@ -74,6 +74,7 @@ class Model:
         covariates: input that nobody drives, a parameter that is known in every row -> its column; the last of the inputs.
         per: uncertain parameter -> column of the groups from one to another of which it differs (`simulators.groups`).
         spreads: such a parameter -> range of its spread, where one was given.
+        known_groups: such a parameter -> group -> range of its value there, where it is known.
         asked: further columns of groups -> the key of an effect that names them.
         groups: column -> names of the groups, where they are known: then inputs and parameters of groups are there.
         base: the model without them; None: this is it.
@@ -105,6 +106,7 @@ class Model:
     covariates: dict[str, str] = field(default_factory=dict)
     per: dict[str, str] = field(default_factory=dict)
     spreads: dict[str, tuple[float, float]] = field(default_factory=dict)
+    known_groups: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     asked: dict[str, str] = field(default_factory=dict)
     groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
     base: "Model | None" = None
@@ -275,7 +277,7 @@ class Declared:
             )
         self._check_dynamics()
         params, fixed, derived = read_parameters(self.parameters)
-        per, spreads = read_groupings(self.parameters)
+        per, spreads, known_groups = read_groupings(self.parameters)
         sections = (self.states, self.inputs, self.parameters, self.intermediates, self.tables)
         tables = read_tables(self.tables, (name for section in sections for name in section))
         defined = in_order(read_intermediates(self.intermediates) | tables, "write one of them without the others")
@@ -325,6 +327,7 @@ class Declared:
             covariates=columns,
             per=per,
             spreads=spreads,
+            known_groups=known_groups,
             limits={
                 name: read_limits(f"sim.states.{name}", node) for name, node in self.states.items() if "limits" in node
             },

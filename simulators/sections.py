@@ -36,6 +36,13 @@ PROPERTIES: dict[str, Schema] = {
     "spread": pair(
         NUMBER, "[low, high] of how far groups differ, one sd; of the logarithm where the range has one sign."
     ),
+    "groups": {
+        "type": "object",
+        "additionalProperties": pair(
+            NUMBER, "[low, high] of its value: +-2 sd, of the logarithm where it has one sign."
+        ),
+        "description": "What is known of groups: name -> value there. Of the others only what the population says.",
+    },
     "column": {"type": "string", "description": "Column of the measurements that knows the parameter in every row."},
     "prior": {"enum": list(PRIORS), "description": "Law of an uncertain parameter; normal: the range is +-2 sd."},
     "value": TERM

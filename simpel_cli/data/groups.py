@@ -12,7 +12,7 @@ LEAST = 2  # groups: one tells nothing of a spread
 
 
 def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, ...]]:
-    """Return the groups of the training rows, by column, in order of appearance.
+    """Return the groups of the training rows, by column, in order of appearance, and behind them those that a simulator knows.
 
     Args:
         model: that names the columns.
@@ -27,7 +27,8 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
         labels = _labels(table, column, key)[rows.number]
         train = rows.split == "train"
         names = tuple(dict.fromkeys(label for label in labels[train].tolist() if label))
-        if len(names) < LEAST:
+        given = [model.known_groups.get(parameter, {}) for parameter, by in model.per.items() if by == column]
+        if len(names) < LEAST and not any(given):
             raise DataError(
                 f"{key}: column '{column}' has {len(names)} group in the training rows"
                 f"{f' ({names[0]})' if names else ''}, which tells nothing of a spread. Leave it out, or train on more "
@@ -40,7 +41,7 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
             )
         if rows.next_states.shape[1] == 0:
             _refuse_changes(rows, labels, column, key)
-        found[column] = names
+        found[column] = tuple(dict.fromkeys([*names, *(name for known in given for name in known)]))
     return found
 
 

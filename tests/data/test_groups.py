@@ -23,7 +23,7 @@ from simpel_cli.methods.sysid import SysID, identified
 from simpel_cli.priors.function_prior import SimulatorPrior
 from simpel_cli.scores.gaussian import Gaussian
 from simulators.effects import Expression
-from simulators.groups import UNSEEN, grouped
+from simulators.groups import UNSEEN, grouped, spreads_of
 from simulators.model import Declared, Model, ModelError
 from simulators.worlds.groups import Group, Spread
 from simulators.worlds.simulate import Simulate
@@ -117,6 +117,37 @@ def test_a_transition_is_that_of_the_group() -> None:
     np.testing.assert_allclose(found, 2 * (np.exp(-rates * 0.05) - 1), rtol=1e-6)
 
 
+def test_a_group_that_is_known_has_its_own_value_whatever_the_population() -> None:
+    known = slider(per="ball", groups={"b": [2.0, 3.0]})
+    whole = grouped(known, {"ball": ("a ball", "b")})
+    assert [q.name for q in whole.params] == ["c", "b", "c_spread", "c_of_a_ball", "c_of_another", "c_of_b"]
+    value = whole.params[-1]
+    assert (value.low, value.high, value.unit, value.prior, value.role) == (2.0, 3.0, "1/s", "lognormal", "")
+    with jax.enable_x64(True):
+        step = transition(whole, encoding_of(whole)).step
+        phi = jnp.array([1.0, 1.0, 0.5, 1.0, 0.0, 2.5])
+        found = [float(step(jnp.array([2.0, 0.0, *slot]), phi)[0]) for slot in np.eye(3)]
+    np.testing.assert_allclose(found, 2 * (np.exp(-np.array([np.exp(0.5), 2.5, 1.0]) * 0.05) - 1), rtol=1e-6)
+    assert spreads_of(whole.params) == {2: [3]}
+    every = grouped(slider(per="ball", groups={"b": [2.0, 3.0], "a ball": [1.0, 2.0]}), {"ball": ("a ball", "b")})
+    assert spreads_of(every.params) == {}  # nothing tells of the spread
+
+
+def test_what_the_simulator_knows_of_groups_is_known_without_training_rows_of_them(made) -> None:
+    path, _ = made
+    first, *others = recorded(path, slider(per="ball")).groups["ball"]
+    data = recorded(path, slider(per="ball", groups={"elsewhere": [1.0, 2.0], first: [1.0, 2.0]}))
+    assert data.groups["ball"] == (first, *others, "elsewhere")
+
+
+def test_an_identified_simulator_begins_with_what_is_known_of_groups(made) -> None:
+    path, truth = made
+    ends = {name: [0.9 * own["c"], 1.1 * own["c"]] for name, own in truth.items()}
+    values = values_identified(slider(per="ball", groups=ends), path)
+    for name, own in truth.items():
+        assert values[f"c_of_{name}"] == pytest.approx(own["c"], rel=0.1)
+
+
 def test_what_is_wrong_is_said(made, tmp_path) -> None:
     path, _ = made
     with pytest.raises(DataError, match="column 'subject' is missing"):
@@ -133,6 +164,14 @@ def test_what_is_wrong_is_said(made, tmp_path) -> None:
             recorded(file, slider(per="ball"))
     with pytest.raises(ModelError, match=r"sim.parameters.c.per: 3 is not the name of a column"):
         slider(per=3)
+    with pytest.raises(
+        ModelError, match=r"sim.parameters.c.groups: only of a parameter that differs .* add `per: COLUMN`"
+    ):
+        slider(groups={"a": [1, 2]})
+    with pytest.raises(ModelError, match=r"sim.parameters.c.groups.a.range: low = 2 is not below high = 1; swap them"):
+        slider(per="ball", groups={"a": [2, 1]})
+    with pytest.raises(ModelError, match=r"sim.parameters.c.groups: 3 is not a mapping"):
+        slider(per="ball", groups=3)
 
 
 def test_what_is_wrong_with_groups_of_an_effect_names_its_key(made, tmp_path) -> None:
@@ -154,9 +193,7 @@ def test_what_is_wrong_with_groups_of_an_effect_names_its_key(made, tmp_path) ->
             Expression("late", acts_on="input", operator=operator, parameters={"d": {"range": [0, 1]}}, per="ball")
 
 
-def test_an_identified_simulator_knows_every_group_and_their_spread(made) -> None:
-    path, truth = made
-    model = slider(per="ball")
+def values_identified(model: Model, path) -> dict[str, float]:
     data = recorded(path, model)
     whole = grouped(model, data.groups)
     with jax.enable_x64(True):
@@ -171,11 +208,16 @@ def test_an_identified_simulator_knows_every_group_and_their_spread(made) -> Non
         )  # fmt: skip
         problem = jax.tree.map(lambda a: a[0], done.problems)
         found = np.asarray(identified(method, done.setting, problem, jax.random.key(2), 1).phi)
-    values = dict(zip([q.name for q in whole.params], found, strict=True))
-    for name in data.groups["ball"]:
+    return dict(zip([q.name for q in whole.params], found, strict=True))
+
+
+def test_an_identified_simulator_knows_every_group_and_their_spread(made) -> None:
+    path, truth = made
+    values = values_identified(slider(per="ball"), path)
+    for name in truth:
         own = values["c"] * np.exp(values["c_spread"] * values[f"c_of_{name}"])
         assert abs(own / truth[name]["c"] - 1) < 0.1
-    logs = np.log([truth[name]["c"] for name in data.groups["ball"]])
+    logs = np.log([truth[name]["c"] for name in truth])
     assert values["c_spread"] == pytest.approx(logs.std(ddof=1), rel=0.15)
 
 

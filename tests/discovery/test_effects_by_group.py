@@ -55,6 +55,9 @@ def test_a_drag_of_every_ball_is_found_and_fitted(tmp_path: Path) -> None:
     written = yaml.safe_load(file.read_text())["parameters"]["c"]
     assert written["per"] == "ball"
     assert written["spread"][0] < group["spread"]["value"] < written["spread"][1]
+    for name, (low, high) in written["groups"].items():
+        assert low < group["values"][name]["low"] < group["values"][name]["high"] < high
+    assert list(written["groups"]) == list(truth)
     fitted = simpel(
         tmp_path, "fit", "--config-dir", "run/conf", f"sim={file.stem}", "data=cart", "hydra.run.dir=fit", *TINY
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from simpel_cli.data.estimation.smoother import speeds
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.verdict.groups import differing, spread_of
+from simpel_cli.discovery.verdict.groups import differing, spread_of, values_of
 from simpel_cli.discovery.verdict.verdict import Z95, interval_of
 from simpel_cli.filtering.likelihood.coordinates import LOG_UNIFORM
 from simulators.effects import Term
@@ -19,6 +19,7 @@ from simulators.quantity import HIDDEN, READING
 from simulators.readings import line_of
 
 DECLARED, EXTENDED = "simulators.model.Declared", "simulators.extended.Extended"
+SHARE = 0.95  # of the interval that a prior has for its range
 SURELY = 6.0  # standard deviations from zero beyond which a normal prior has one sign
 STIFF = 8  # Runge-Kutta steps per row: groups at the far end of a population move faster than any that was seen
 NAMES = ("states", "inputs", "parameters", "intermediates", "tables", "outputs")  # sections that introduce names
@@ -34,7 +35,8 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
     """Return name, YAML and what could not be written, each with the reason.
 
     Priors of the effects' parameters are normal, with the 95 % interval of the fit for range, or lognormal (see `law_of`), and
-    likewise the spread of one that differs from group to group; the simulator's own keep the ranges that the user declared.
+    likewise the spread of one that differs from group to group, and the value of every group; the simulator's own keep the
+    ranges that the user declared.
 
     Args:
         sim: the `sim:` node, as declared.
@@ -88,6 +90,10 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             if row in spread and low < high:
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
+                values = values_of(search, trial, spread[row], SHARE).items()
+                parameters[short]["groups"] = {
+                    name: [v["low"], v["high"]] for name, v in values if v["low"] < v["high"]
+                }
     node = (_declared if plain else _extended)(sim, name, written, names, parameters)
     if plain and search.plan.substeps > int(sim.get("substeps", Declared.substeps)):
         node["substeps"] = search.plan.substeps  # which its parameters were fitted with

@@ -49,7 +49,8 @@ def differing(search: Search, trial: Trial) -> list[Differing]:
     for q in model.base.params if model.base else ():
         if q.name in model.per:
             by = model.per[q.name]
-            found.append((grouping(q, by, model.groups[by], model.spreads.get(q.name)), q.name, "", ""))
+            how = grouping(q, by, model.groups[by], model.spreads.get(q.name), model.known_groups.get(q.name))
+            found += [(how, q.name, "", "")] if how.names else []
     for t in trial.terms:
         term = search.terms[t]
         labels = {k.name: k.label for k in term.parameters}
@@ -70,8 +71,15 @@ def spread_of(search: Search, trial: Trial, one: Differing, z: float = Z90) -> d
     return {"value": value, "low": value * float(np.exp(-z * sd)), "high": value * float(np.exp(z * sd))}
 
 
-def values_of(search: Search, trial: Trial, one: Differing) -> dict[str, dict[str, float]]:
-    """Return the value of every group with its 90 % interval, by name, from draws of the posterior as a Gaussian."""
+def values_of(search: Search, trial: Trial, one: Differing, share: float = 0.9) -> dict[str, dict[str, float]]:
+    """Return the value of every group with its interval, by name, from draws of the posterior as a Gaussian.
+
+    Args:
+        search: that was run.
+        trial: the fit.
+        one: the parameter.
+        share: of the draws that lie in the interval.
+    """
     coordinates, optimum = search.plan.coordinates, trial.optimum
     spread = coordinates.value(one.spread, float(optimum.z[one.spread]))
     found = {}
@@ -83,7 +91,7 @@ def values_of(search: Search, trial: Trial, one: Differing) -> dict[str, dict[st
         drawn = np.clip(np.vstack([at, at + white @ apart.T]), 0, 1)
         common, delta = (np.array([coordinates.value(row, v) for v in drawn[:, j]]) for j, row in enumerate(rows))
         values = common * np.exp(spread * delta) if one.how.ratio else common + spread * delta
-        low, high = np.quantile(values[1:], [0.05, 0.95])
+        low, high = np.quantile(values[1:], [(1 - share) / 2, (1 + share) / 2])
         found[name] = {"value": float(values[0]), "low": float(low), "high": float(high)}
     return found
 
