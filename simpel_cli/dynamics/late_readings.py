@@ -5,8 +5,9 @@ A delay d and a lag tau act together as exp(-d s)/(1 + tau s). Along a smooth mo
     y = c - m_1(d) c' + m_2(d) c'' - m_3(d) c''',    m_n(d) = sum over i <= n of d^i tau^(n-i)/i!,    c: what a prompt one shows
 
 which holds while d and tau are short against the motion (the next term is about tau^4 times the fourth derivative). Inputs
-are held from a row to the next, so c' jumps at the rows, and with it c'' and c'''. A jump J_n of the n-th derivative at age a
-adds what the motion since then does not show: of the time before the jump that is seen, d - a and what the lag adds,
+are held over an integration step, so c' jumps between steps, and with it c'' and c''': at the rows, and within one where an
+input is late itself. A jump J_n of the n-th derivative at age a adds what the motion since then does not show: of the time
+before the jump that is seen, d - a and what the lag adds,
 
     -(-1)^n J_n m_n(d - a)  where the delay reaches behind it,    -(-1)^n J_n tau^n exp((d - a)/tau)  where d <= a.
 
@@ -87,8 +88,10 @@ class Late(NamedTuple):
         past = min(JUMPS, len(rows) - 1) if self.driven else 0
         if not past:
             return shown
-        jumps = [motion(rows[-k, 0], 0) - motion(rows[-k - 1, -1], -1) for k in range(1, past + 1)]
-        return shown + echo(d, tau, jnp.stack(jumps), self.dt)
+        steps = rows.reshape(-1, *rows.shape[2:])[-(past + 1) * rows.shape[1] :]
+        begins, ends = jax.vmap(lambda u: motion(u, 0))(steps[1:]), jax.vmap(lambda u: motion(u, -1))(steps[:-1])
+        latest_first = (begins - ends)[::-1][: past * rows.shape[1]]
+        return shown + echo(d, tau, latest_first, ages(len(latest_first), self.dt / rows.shape[1], d.dtype))
 
     def meant(self, read: Point, rows: Rows, phi: Float[Array, " dp"]) -> Point:
         """Return the states, as prompt sensors show them, of what late ones showed at the end of rows."""
@@ -160,11 +163,19 @@ def signed_moments(d: Float[Array, "n ..."], tau: Float[Array, "n ..."]) -> Floa
     return jnp.stack(found)
 
 
+def ages(count: int, step: float, dtype: jnp.dtype) -> Float[Array, " K"]:
+    """Return how long ago the jumps between so many steps were, s, the latest first."""
+    return jnp.arange(1, count + 1, dtype=dtype) * step
+
+
 def echo(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], dt: float
+    d: Float[Array, "ny ..."],
+    tau: Float[Array, "ny ..."],
+    jumps: Float[Array, "K orders ny ..."],
+    ages: Float[Array, " K"],
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its derivatives jumped; jumps: the latest first."""
-    age, faded = _faded(d, tau, len(jumps), dt)
+    """Return what every sensor still shows of the time before its derivatives jumped, so many seconds ago each."""
+    age, faded = _faded(d, tau, ages)
     behind = signed_moments(jnp.maximum(-age, 0.0), jnp.broadcast_to(tau[None], age.shape))
     return -jnp.sum(jnp.swapaxes(behind, 0, 1) * faded[:, None] * jumps, axis=(0, 1))
 
@@ -174,11 +185,10 @@ def _in_time(function: Callable[..., Array], rate: Callable[..., Array], rise: A
     return lambda x, u: jax.jvp(function, (x, u), (rate(x, u), rise))[1]
 
 
-def _faded(d: Array, tau: Array, count: int, dt: float) -> tuple[Array, Array]:
-    """Return the time since so many rows that has been shown, and how much of what was before is left; the latest first."""
-    ages = jnp.arange(1, count + 1, dtype=d.dtype) * dt
+def _faded(d: Array, tau: Array, ages: Array) -> tuple[Array, Array]:
+    """Return the time since each jump that has been shown, and how much of what was before is left."""
     age = ages.reshape(-1, *(1,) * d.ndim) - d[None]
-    return age, jnp.exp(-jnp.maximum(age, 0.0) / (tau[None] + 1e-9 * dt))
+    return age, jnp.exp(-jnp.maximum(age, 0.0) / (tau[None] + 1e-9 * jnp.min(ages)))
 
 
 def _solved(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:

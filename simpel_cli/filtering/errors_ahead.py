@@ -215,7 +215,7 @@ def _alone(
 
 def _free(rule: Filter, p: Array, u_sub: Array, mean: Array, start: Array, first: int, ny: int) -> Array:
     """Return what is read along a simulation that begins with the filter's mean in the last of the first rows, (T, ny)."""
-    rows, quiet = len(u_sub), no_jumps(ny, start)
+    rows, quiet = len(u_sub), no_jumps(ny, start, rule.jumps)
     simulated = jnp.ones(len(start)).at[jnp.array(rule.remainders, int)].set(0.0)
 
     def run(carry: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], Array]:
@@ -237,7 +237,7 @@ def _window(
     track, held = rule.track(p, noise, y, ok, u, start, spread)
     u_sub = rule.delayed_inputs(p, u)
     rows, ny = y.shape
-    quiet = no_jumps(ny, start)
+    quiet = no_jumps(ny, start, rule.jumps)
     jumps = jnp.broadcast_to(quiet, (rows, *quiet.shape)) if held.jumps is None else held.jumps
 
     def step(carry: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], None]:

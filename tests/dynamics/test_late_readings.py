@@ -1,5 +1,6 @@
 """Transitions of what late sensors show, against readings of a linear system that are computed finely."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from simpel_cli.dynamics.late_readings import behind
+from simpel_cli.dynamics.arriving import arriving
+from simpel_cli.dynamics.casadi_jax import to_jax
+from simpel_cli.dynamics.late_readings import behind, late_of
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simulators.model import Declared
@@ -128,3 +131,21 @@ def test_beside_a_late_input() -> None:
     model = late.model()
     behind = transition(model, encoding_of(model, stack=3)).step(jnp.concatenate([x, u]), jnp.zeros(0))
     np.testing.assert_allclose(ahead, behind, rtol=1e-9)
+
+
+@pytest.mark.parametrize("late", [0.5, 1.5])
+def test_an_input_that_arrives_within_a_row_jumps_there(late: float) -> None:
+    """A delay of half a row: the same as rows of half the length, whose inputs come in twos, a row of these later."""
+    given = swing({"v": {"delay": 1.3 * DT}})
+    fine = replace(given, dt=DT / 2, substeps=4).model()
+    rows = replace(given, substeps=8, inputs={"u": given.inputs["u"] | {"delay": late * DT}}).model()
+    x, u = jnp.array([0.3, 0.4]), jnp.array([0.9, -0.2, 0.5, 0.1, -0.7, 0.3])
+    halves = jnp.repeat(u, 2)[: -int(2 * late) or None]
+    of_rows = late_of(rows, to_jax(rows.function()))
+    of_halves = late_of(fine, to_jax(fine.function()))
+    assert of_rows is not None
+    assert of_halves is not None
+    now = arriving(rows, u[:, None], jnp.zeros(0), 2)
+    found = of_rows.behind(x, now, jnp.zeros(0))
+    expected = of_halves.behind(x, jnp.broadcast_to(halves[:, None, None, None], (len(halves), 4, 1, 1)), jnp.zeros(0))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.trials import Search
+from simpel_cli.filtering.errors_ahead import _free
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.sensor_delay import JUMPS
 from simpel_cli.filtering.likelihood.track import Noise
@@ -126,21 +127,27 @@ def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> 
     np.testing.assert_allclose(tracks[0], tracks[1], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("between", ["held", "linear"])
+@pytest.mark.parametrize(
+    ("between", "arrives"), [("held", 0.0), ("linear", 0.0), ("held", 0.5), ("held", 0.375), ("held", 1.25)]
+)
 @pytest.mark.parametrize(("late", "lag"), [(0.0, 0.06), (0.06, 0.0), (0.1, 0.1), (0.3, 0.0), (0.25, 0.1)])
-def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float, between: str) -> None:
+def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float, between: str, arrives: float) -> None:
     """With a slow model, whose rates are those of the input: the reading is the input's integral, delayed and lagged.
 
-    Where inputs go straight from a row to the next, their slopes jump.
+    Where inputs go straight from a row to the next, their slopes jump; one that is late itself, by so many rows, jumps within
+    a row. A simulation shows the same.
     """
     effects = [
-        Expression(kind, acts_on="v", operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
-        for kind in ("sensor_delay", "sensor_lag")
+        Expression(kind, acts_on=on, operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
+        for kind, on in (("sensor_delay", "v"), ("sensor_lag", "v"), ("delay", "u"))
     ]
-    plan = setup(replace(model(), between_rows={"u": between}), recording(), (), effects, 2)
+    effects = effects[: 3 if arrives else 2]
+    plan = setup(replace(model(), between_rows={"u": between}), recording(), (), effects, 8 if arrives else 2)
     names = [q.name for q in plan.augmented.params]
     p = p_of_plan(plan, 1e-9, 1.0)
     p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late, lag
+    if arrives:
+        p[names.index("delay_u_t")] = arrives * DT
     u = np.random.default_rng(5).normal(size=ROWS)
     held = np.concatenate([np.full(plan.lead, u[0]), u])
     rows = jnp.zeros((ROWS, 2))
@@ -149,6 +156,8 @@ def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float, be
     fine = 400  # steps of a row, of the reference
     times = (np.arange(-20 * fine, ROWS * fine) + 0.5) * DT / fine
     rows_of = np.clip((times // DT).astype(int), 0, ROWS - 1)
+    if arrives:
+        rows_of = np.clip(np.floor(times / DT - arrives).astype(int), 0, ROWS - 1)
     slope = u[rows_of] if between == "held" else np.interp(times, np.arange(ROWS) * DT, u)
     value = np.cumsum(slope) * DT / fine
     value -= np.interp(0.0, times, value)
@@ -158,7 +167,11 @@ def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float, be
     expected = np.interp(np.arange(ROWS) * DT - late, times, read)
     found = -np.asarray(track.innovation)[:, 1]
     begin = 1 if between == "held" else JUMPS + 1  # before the first row inputs go on as they begin
-    np.testing.assert_allclose(found[begin:], expected[begin:], atol=0.02 * np.abs(expected).max() * (lag > 0) + 2e-3)
+    within = 0.02 * np.abs(expected).max() * (lag > 0) + 2e-3
+    np.testing.assert_allclose(found[begin:], expected[begin:], atol=within)
+    u_sub = plan.rule.delayed_inputs(jnp.asarray(p), jnp.asarray(held)[:, None])
+    simulated = _free(plan.rule, jnp.asarray(p), u_sub, jnp.zeros((ROWS, 2)), jnp.zeros(2), 1, 2)[:, 1]
+    np.testing.assert_allclose(simulated[begin:], expected[begin:], atol=within)
 
 
 def test_derivatives_in_what_moves_are_those_of_differences(plan: Setup) -> None:

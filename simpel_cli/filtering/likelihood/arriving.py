@@ -9,12 +9,18 @@ from jaxtyping import Array
 from simpel_cli.dynamics.between_rows import WAY, beyond
 from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.filtering.likelihood.augmented import Augmented
-from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, RATE_LIMIT
+from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT
 
 
 def moving_of(augmented: Augmented) -> tuple[int, ...]:
     """Return the inputs that are not held between rows, or of which it is asked whether they are."""
     return tuple(sorted({*augmented.model.linear, *(signal for signal, _ in augmented.operators[BETWEEN_ROWS])}))
+
+
+def may_be_late(augmented: Augmented) -> bool:
+    """Whether an input may change within a row, as one that is late does."""
+    late = (augmented.operators[kind] for kind in ON_INPUT)
+    return any(late) or any(augmented.own_delay) or any(augmented.own_lag)
 
 
 def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[[Array, Array], Array]:

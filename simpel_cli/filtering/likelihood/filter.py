@@ -27,14 +27,23 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from simpel_cli.dynamics.integrate import at_stages
-from simpel_cli.filtering.likelihood.arriving import arriving_inputs, moving_of, per_signal
+from simpel_cli.filtering.likelihood.arriving import arriving_inputs, may_be_late, moving_of, per_signal
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import at_row, early_of, pace_of
 from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, value, with_slope
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import Timing, pushes_of
-from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, moving, no_jumps, pushed, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import (
+    JUMPS,
+    Motion,
+    back,
+    moving,
+    no_jumps,
+    pushed,
+    pushed_within,
+    still_shown,
+)
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
@@ -121,23 +130,23 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def flow_with_slope(p: Array, x: Array, u: Array, sure: Array) -> tuple[tuple[Array, Array, Array, Array], Any]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative.
 
-        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...), and
-        the slopes of the rates there.
+        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...), the
+        slopes of the rates there, and the rates.
         """
 
-        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
+        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array, Array]]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
             h, h_phi = length(u), length(u, 2)
             there = x + h * weights[0] * slope
             slope, rate_x = apart(sure, rates, there, u, p)
             slope_phi = apart(sure, product, rate_x, phi + h_phi * weights[0] * slope_phi)
             end, end_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
-            return (x, phi, end, end_phi, slope, slope_phi, rate_x), (there, rate_x)
+            return (x, phi, end, end_phi, slope, slope_phi, rate_x), (there, rate_x, slope)
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
-        def step(carry: Any, u: Array) -> tuple[Any, tuple[Array, Array]]:
+        def step(carry: Any, u: Array) -> tuple[Any, tuple[Array, Array, Array]]:
             x, phi, *_ = carry
             end, passed = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
             return (end[2], end[3], end[4], end[6]), jax.tree.map(lambda a: a[jnp.array([0, 2, 3])], passed)
@@ -146,6 +155,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     own_delays, own_lags = augmented.own_late
     late_ones = bool(sensor_delays or sensor_lags or any(own_delays) or any(own_lags))
+    # an input that is late itself makes a motion jump within a row
+    parts = substeps if may_be_late(augmented) else 1
+    smooth_since = 0 if parts == 1 or linear else substeps - 1  # the substep of a row from which on a motion is smooth
 
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
@@ -157,6 +169,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             return moving(rate, rate_x)
         first, last = (plain_rates(x, end, p) for end in (u[0], u[-1]))
         return moving(rate, rate_x, (last - first) / length(u[0]))
+
+    def arrived(x: Array, u: Array, p: Array) -> Array:
+        """Return how the rates jump between the substeps of a row, (substeps - 1, nx, ...), at about this state."""
+        at = jax.vmap(lambda u: plain_rates(x, u, p))
+        return at(u[1:, 0]) - at(u[:-1, -1])
 
     def seen(
         p: Array,
@@ -178,7 +195,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             slope = slope_back(early, prompt, rate_x)
         if late_ones:
             d, tau = late_by(p)
-            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt)
+            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt / parts)
             slope = slope - (d + tau)[:, None] * product(prompt, rate_x)
         return read, slope, prompt
 
@@ -222,14 +239,20 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 variances.append(s)
                 gains.append(gain)
             (following, jacobian, rate_after, rate_x_after), passed = flow_with_slope(p, x, u_k, sure)
+            stages, stage_x, stage_rate = passed
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
-            held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, *passed, *before)
+            held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, stages, stage_x, *before)
             begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
             motion = moving_in(p, following, u_k[-1], rate_after, rate_x_after)
             if late_ones:
-                step = dt if pace is None else dt * pace[None]
-                motion = motion.since(moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p)), step)
+                at = smooth_since, 0
+                begun = moving_in(p, stages[at], u_k[smooth_since], stage_rate[at], stage_x[at])
+                motion = motion.since(begun, (substeps - smooth_since) * length(u_k[-1, -1]))
+                if parts > 1:
+                    # where the last stage of a substep was is not quite its end
+                    ends = jax.vmap(applied)(stage_x[:-1, 2], stages[1:, 0] - stages[:-1, 2]) + stage_rate[:-1, 2]
+                    jumps = pushed_within(jumps, prompt, stage_rate[1:, 0] - ends, rate_x_after)
             carry = (
                 following,
                 after(cov, jacobian, of_row(half, pace), sure),
@@ -244,7 +267,15 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         first = u_sub[0, 0, 0]
         rate, rate_x = rates(start, first, p)
         motion = moving_in(p, start, u_sub[0, 0], rate, rate_x)  # as if it had been going on so
-        begin = (start, diagonal(spread), first, motion, rate_x, no_jumps(ny, start), at_rest(first, start, rate))
+        begin = (
+            start,
+            diagonal(spread),
+            first,
+            motion,
+            rate_x,
+            no_jumps(ny, start, JUMPS * parts),
+            at_rest(first, start, rate),
+        )
         return jax.lax.scan(row, begin, (y, counted(ok), u_sub))[1]
 
     def at_rest(u: Array, x: Array, rate: Array) -> tuple[Array, ...]:
@@ -263,17 +294,24 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
         if late_ones:
             (d, tau), motion = late_by(p), moving_in(p, x, u_before[-1], *rates(x, end, p))
-            begun = moving_in(p, x_before, u_before[0], *rates(x_before, u_before[0, 0], p))
-            motion = motion.since(begun, dt if pace is None else dt * pace[None])
-            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt)
-            jumps = pushed(jumps, slope, motion, moving_in(p, x, u[0], *rates(x, u[0, 0], p)))
+            h = (substeps - smooth_since) * length(end)
+            at = x - h * motion.rate + h**2 / 2 * motion.bend if smooth_since else x_before
+            first = u_before[smooth_since]
+            motion = motion.since(moving_in(p, at, first, *rates(at, first[0], p)), h)
+            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt / parts)
+            going = moving_in(p, x, u[0], *rates(x, u[0, 0], p))
+            jumps = pushed(jumps, slope, motion, going)
+            if parts > 1:
+                change = arrived(x + substeps / 2 * length(u[0, 0]) * going.rate, u, p)
+                jumps = pushed_within(jumps, slope, change, rates(x, u[0, 0], p)[1])
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
-    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, bool(linear))
+    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, bool(linear), parts)
     return Filter(
-        "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs
-    )
+        "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs,
+        JUMPS * parts,
+    )  # fmt: skip
 
 
 def _of_inputs(function: Any, nu: int) -> Any:

@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from simpel_cli.dynamics.late_readings import echo
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
-from simpel_cli.filtering.likelihood.sensor_delay import back, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, back, of_rates, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, sure_of, where_asked
 from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
@@ -33,6 +34,7 @@ class Timing(NamedTuple):
         of_inputs: rows of p that say when an input arrives.
         late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
         rising: whether inputs go straight from a row to the next.
+        parts: of a row, between which an input may arrive.
     """
 
     dt: float
@@ -41,6 +43,7 @@ class Timing(NamedTuple):
     of_inputs: Sequence[int]
     late_by: Callable[[Array], tuple[Array, Array]] | None
     rising: bool
+    parts: int
 
 
 def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:
@@ -65,7 +68,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         late = None if late_by is None else jax.tree.map(at_rows, (late_by(p), _along(late_by, p, units)))
         before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
 
-        def of(part: tuple[Any, ...]) -> tuple[Ways, Pushes]:
+        def of(part: tuple[Any, ...]) -> tuple[Ways, Pushes, Array | None]:
             """Rows are points like others: their axis goes in front of those of the points, and back."""
             found = _of_rows(
                 at_rows(p), rows, asked, late, sure, *jax.tree.map(lambda a: jnp.moveaxis(a, 0, -p.ndim), part)
@@ -73,7 +76,9 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             return jax.tree.map(lambda a: jnp.moveaxis(a, -p.ndim, 0), found)
 
         size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
-        ways, found = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
+        ways, found, within = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
+        if within is not None:
+            found = found._replace(reading=found.reading + _since(within))
         if found.bent is not None:
             assert bend is not None
             begin = at.predicted[0], before[0], None if moved_before is None else moved_before[0]
@@ -84,8 +89,11 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
     def _of_rows(
         p: Array, rows: Array, asked: Array, late: Any, sure: Array, predicted: Array, held: Held, before: Array, moved: Any,
         moved_before: Any,
-    ) -> tuple[Ways, Pushes]:  # fmt: skip
-        """Do so for rows, the first axis of the points; `moved`: (D, substeps, K, nu, ...) how the inputs change."""
+    ) -> tuple[Ways, Pushes, Array | None]:  # fmt: skip
+        """Do so for rows, the first axis of the points; `moved`: (D, substeps, K, nu, ...) how the inputs change.
+
+        Behind them: what the readings in the rows to come show of jumps within this one, (D, JUMPS, ny, ...).
+        """
         u = held.u[:, _stages_of(held.u.shape[1])]  # (substeps, 3, nu, ...)
         x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
         moved_s = None
@@ -104,6 +112,11 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             push_now = _pushed(rates, p, rows, *begin, first_of(moved_s), asked)
             first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
             push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
+        within = None
+        if late is not None and timing.parts > 1:
+            assert end is not None
+            changes = jnp.moveaxis(push[:, :, 1:, 0] - push[:, :, :-1, 2], 2, 1)
+            within = jax.vmap(lambda change: _still_to_be_shown(late[0], held.prompt, change, end))(changes)
         reading = _pushed(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s), asked)
         if early is not None:
             then = _pushed(sensors, p, rows, predicted, before, moved_before, asked)
@@ -112,7 +125,9 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
 
             def shown(late: tuple[Array, Array]) -> Array:
                 assert held.jumps is not None
-                return jnp.sum(held.prompt * back(*late, held.motion), axis=1) + still_shown(*late, held.jumps, dt)
+                return jnp.sum(held.prompt * back(*late, held.motion), axis=1) + still_shown(
+                    *late, held.jumps, dt / timing.parts
+                )
 
             reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
 
@@ -125,9 +140,29 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
             push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
             push_bent = squares[:, :, :, 1] if early is not None else None
-        return Ways(first, now, end, turn), Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
+        found = Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
+        return Ways(first, now, end, turn), found, within
+
+    def _still_to_be_shown(late: tuple[Array, Array], prompt: Array, change: Array, rate_x: Array) -> Array:
+        """Return what is shown in the next rows, (JUMPS, ny, ...), where the rates jump between the substeps of this one."""
+        jumps = of_rates(prompt, change, rate_x)
+        ago = dt / substeps * jnp.arange(substeps - 1, 0, -1, dtype=rate_x.dtype)  # at the end of the row
+        return jnp.stack([echo(*late, jumps, ago + k * dt) for k in range(JUMPS)])
 
     return pushes
+
+
+def _since(within: Array) -> Array:
+    """Return what every row shows of those before it, (T, D, ny, ...).
+
+    Args:
+        within: what each row shows later, (T, D, JUMPS, ny, ...).
+    """
+    total = jnp.zeros_like(within[:, :, 0])
+    for k in range(JUMPS):
+        back = k + 1
+        total = total + jnp.concatenate([jnp.zeros_like(within[:back, :, k]), within[:-back, :, k]])[: len(total)]
+    return total
 
 
 def _slopes(of: Differentiated, p: Array, x: Array, u: Array) -> Slopes:

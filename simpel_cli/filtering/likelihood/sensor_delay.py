@@ -2,13 +2,14 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.late_readings import JUMPS, ORDERS, echo, signed_moments
+from simpel_cli.dynamics.late_readings import JUMPS, ORDERS, ages, echo, signed_moments
 from simpel_cli.filtering.likelihood.small_matrices import applied
 
-__all__ = ["JUMPS", "Motion", "back", "moving", "no_jumps", "pushed", "still_shown"]
+__all__ = ["JUMPS", "Motion", "back", "moving", "no_jumps", "of_rates", "pushed", "pushed_within", "still_shown"]
 
 
 class Motion(NamedTuple):
@@ -29,7 +30,7 @@ class Motion(NamedTuple):
         return jnp.stack([self.rate, self.bend, self.turn + self.rest])
 
     def since(self, begin: "Motion", step: Array | float) -> "Motion":
-        """Return this motion at the end of a row, with its rest; `begin`: of the row; `step`: its length, s."""
+        """Return this motion at the end of a step, with its rest; `begin`: of the step; `step`: its length, s."""
         return self._replace(rest=(self.bend - begin.bend) / step - (self.turn + begin.turn) / 2)
 
 
@@ -53,13 +54,33 @@ def pushed(
     return jnp.concatenate([latest[None], jumps[:-1]])
 
 
-def no_jumps(ny: int, x: Float[Array, "nx ..."]) -> Float[Array, "K orders ny ..."]:
+def pushed_within(
+    jumps: Float[Array, "K orders ny ..."],
+    prompt: Float[Array, "ny nx ..."],
+    change: Float[Array, "n nx ..."],
+    rate_x: Float[Array, "nx nx ..."],
+) -> Float[Array, "K orders ny ..."]:
+    """Add the jumps between the steps of a row, the first of which comes first; change: of the rates there."""
+    return jnp.concatenate([of_rates(prompt, change, rate_x)[::-1], jumps])[: len(jumps)]
+
+
+def of_rates(
+    prompt: Float[Array, "ny nx ..."], change: Float[Array, "n nx ..."], rate_x: Float[Array, "nx nx ..."]
+) -> Float[Array, "n orders ny ..."]:
+    """Return how the derivatives of what is read jump where the rates do; rate_x: slope of these."""
+    each = [change]
+    for _ in range(1, ORDERS):
+        each.append(jax.vmap(lambda one: applied(rate_x, one))(each[-1]))
+    return jnp.stack([jnp.sum(prompt[None] * order[:, None], axis=2) for order in each], axis=1)
+
+
+def no_jumps(ny: int, x: Float[Array, "nx ..."], count: int = JUMPS) -> Float[Array, "K orders ny ..."]:
     """Return the start of a record, before which nothing jumped."""
-    return jnp.zeros((JUMPS, ORDERS, ny, *x.shape[1:]), x.dtype)
+    return jnp.zeros((count, ORDERS, ny, *x.shape[1:]), x.dtype)
 
 
 def still_shown(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], dt: float
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], step: float
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its motion jumped; jumps: the latest first."""
-    return echo(d, tau, jumps, dt)
+    """Return what every sensor still shows of the time before its motion jumped; jumps: one a step, the latest first."""
+    return echo(d, tau, jumps, ages(len(jumps), step, d.dtype))

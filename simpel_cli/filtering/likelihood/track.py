@@ -92,9 +92,10 @@ class Filter(NamedTuple):
         measure: (p, x, u) -> what the sensors read.
         read: (p, x of the row before, its u of the substeps, x, u of the substeps, jumps) -> what is read in a row, of which
             each value may have been measured before it, and the jumps of its motion before the next row, which
-            late sensors still show: (JUMPS, ORDERS, ny), 0 before the first row.
+            late sensors still show: (jumps, ORDERS, ny), 0 before the first row.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
             and end; what stands behind the inputs, behind them.
+        jumps: of the motion that late sensors may still show: of some rows, one for every step in which an input may arrive.
         remainders: rows of the state that are no part of a simulation (see `remainders.py`).
     """
 
@@ -106,4 +107,5 @@ class Filter(NamedTuple):
     measure: Callable[..., Float[Array, " ny"]]
     read: Callable[..., tuple[Float[Array, " ny"], Float[Array, "K orders ny"]]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
+    jumps: int
     remainders: tuple[int, ...] = ()
