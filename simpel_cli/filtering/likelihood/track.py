@@ -107,5 +107,5 @@ class Filter(NamedTuple):
     measure: Callable[..., Float[Array, " ny"]]
     read: Callable[..., tuple[Float[Array, " ny"], Float[Array, "K orders ny"]]]
     delayed_inputs: Callable[..., Float[Array, "T substeps K nu"]]
-    jumps: int
+    jumps: int = 0
     remainders: tuple[int, ...] = ()
