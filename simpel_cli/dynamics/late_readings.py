@@ -46,6 +46,7 @@ class Late(NamedTuple):
         dt: distance of rows, s.
         substeps: per row.
         driven: whether there are inputs.
+        late_inputs: whether these may arrive within a row.
     """
 
     whole: Whole
@@ -54,6 +55,7 @@ class Late(NamedTuple):
     dt: float
     substeps: int
     driven: bool
+    late_inputs: bool
 
     def behind(
         self, x: Point, rows: Rows, phi: Float[Array, " dp"], now: Float[Array, " du"] | None = None
@@ -88,10 +90,20 @@ class Late(NamedTuple):
         past = min(JUMPS, len(rows) - 1) if self.driven else 0
         if not past:
             return shown
-        steps = rows.reshape(-1, *rows.shape[2:])[-(past + 1) * rows.shape[1] :]
-        begins, ends = jax.vmap(lambda u: motion(u, 0))(steps[1:]), jax.vmap(lambda u: motion(u, -1))(steps[:-1])
-        latest_first = (begins - ends)[::-1][: past * rows.shape[1]]
-        return shown + echo(d, tau, latest_first, ages(len(latest_first), self.dt / rows.shape[1], d.dtype))
+        if rows.shape[2] > 1:  # inputs that go on from row to row: their slopes jump at the rows
+            at_rows = [motion(rows[-k, 0], 0) - motion(rows[-k - 1, -1], -1) for k in range(1, past + 1)]
+            return shown + echo(d, tau, jnp.stack(at_rows), ages(past, self.dt, d.dtype))
+        # where an input is late itself, between any two substeps; the rates' slope is that of the latest
+        steps = rows[-past - 1 :, :, 0] if self.late_inputs else rows[-past - 1 :, -1:, 0]
+        every = jax.vmap(lambda u: rate(x, u))(steps.reshape(-1, steps.shape[-1]))
+        count = past * steps.shape[1]
+        change = jnp.diff(every, axis=0)[::-1][:count]
+        turned = jax.vmap(jax.linearize(lambda x: rate(x, rows[-1, -1, -1]), x)[1])
+        orders = [change]
+        for _ in range(1, ORDERS):
+            orders.append(turned(orders[-1]))
+        jumps = jax.vmap(jax.vmap(along))(jnp.stack(orders, axis=1))
+        return shown + echo(d, tau, jumps, ages(count, self.dt / steps.shape[1], d.dtype))
 
     def meant(self, read: Point, rows: Rows, phi: Float[Array, " dp"]) -> Point:
         """Return the states, as prompt sensors show them, of what late ones showed at the end of rows."""
@@ -113,10 +125,12 @@ class Late(NamedTuple):
                 column = column + moment * way[jnp.array(late)]
             columns.append(column)
         slope = jnp.stack(columns, axis=1)
-        for _ in range(STEPS):
+
+        def step(x: Point, _: None) -> tuple[Point, None]:
             off = (x + self.behind(x, rows, phi)[: len(x)] - read)[jnp.array(late)]
-            x = x.at[jnp.array(late)].add(-_solved(slope, off))
-        return x
+            return x.at[jnp.array(late)].add(-_solved(slope, off)), None
+
+        return jax.lax.scan(step, x, length=STEPS)[0]  # compiled once
 
 
 def late_of(model: Model, whole: Whole) -> Late | None:
@@ -131,7 +145,8 @@ def late_of(model: Model, whole: Whole) -> Late | None:
 
     late = model.sensor_delay.keys() | model.sensor_lag.keys()
     states = tuple(i for i, q in enumerate(model.states) if q.name in late)
-    return Late(whole, times, states, model.dt, model.substeps, bool(model.inputs))
+    late_inputs = bool(model.delay or model.lag)
+    return Late(whole, times, states, model.dt, model.substeps, bool(model.inputs), late_inputs)
 
 
 def behind(model: Model, states: np.ndarray, inputs: np.ndarray, phi: np.ndarray) -> np.ndarray:

@@ -34,10 +34,11 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
         gains: evidence of the candidates in the first step.
     """
     allowed = {tuple(pair) for pair in truth.get("may_be", ())}  # a nuisance of a sensor may be named as such
-    claimed = [
-        e for e in found["effects"] if not allowed & {(m["name"], m["acts_on"]) for m in e.get("class_members", [])}
-    ]
     kind = truth["kind"]
+    # of a class that holds both, the planted effect is asked for
+    asked = {(name, p["acts_on"]) for p in truth["effects"] for name in p["accept"]} if kind != "none" else set()
+    classes = [{(m["name"], m["acts_on"]) for m in e.get("class_members", [])} for e in found["effects"]]
+    claimed = [e for e, own in zip(found["effects"], classes, strict=True) if own & asked or not own & allowed]
     if kind == "none":
         left = found["verdict"] == "unexplained" or found["remainder"]
         return FALSE if claimed else UNEXPLAINED if left else RIGHT

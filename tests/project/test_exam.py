@@ -304,6 +304,9 @@ ASYMMETRIC = claim("asymmetric_friction")
 PAIR = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "input_offset", "acts_on": "u"}]
 LEFT = {"acts_on": "v", "depends_on": ["v"]}
 LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts_on": "v"}]}
+LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
+    "class_members": [{"name": name, "acts_on": "v"} for name in ("sensor_delay", "sensor_lag")]
+}
 
 
 @pytest.mark.parametrize(
@@ -316,6 +319,8 @@ LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts
         ("none", [], verdict(claim("coulomb_friction"), remainder=LEFT), "false effect"),
         ("one", [COULOMB], verdict(claim("coulomb_friction")), "right"),
         ("one", [COULOMB], verdict(claim("coulomb_friction", on="w")), "wrong"),
+        ("one", [planted("sensor_lag", on="v")], verdict(LATE_OR_SLOW), "tie"),
+        ("one", [COULOMB], verdict(LATE_OR_SLOW, claim("coulomb_friction")), "right"),
         ("one", [COULOMB], verdict(claim("stribeck_friction")), "wrong"),
         ("one", [COULOMB], verdict(claim("stribeck_friction", "coulomb_friction")), "tie"),
         ("one", [COULOMB], verdict(claim("coulomb_friction"), claim("input_delay", on="u")), "wrong"),
