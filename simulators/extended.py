@@ -46,7 +46,7 @@ class Extended:
     Args:
         name: letters, digits and single underscores.
         base: node of the simulator that the terms are added to.
-        parameters: name: {unit, range, prior, per, spread} or a number, as those of `Declared`.
+        parameters: name: {unit, range, prior, per, spread, groups} or a number, as those of `Declared`.
         inputs: input: {value: expression in its place, delay, lag, between_rows}, each if there is one; see `Declared`.
         dynamics: state: expression that is added to its rate, in states, inputs, parameters, and rate_STATE for the rate that
             the simulator itself has.

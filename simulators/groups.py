@@ -38,9 +38,9 @@ class Grouping(NamedTuple):
         by: column that names the groups.
         ratio: whether a group has a factor, else something that is added.
         spread: s, a parameter of the population.
-        members: delta of every group; the last is of one that was never seen.
+        members: delta of every group of which nothing is known; the last is of one that was never seen.
         slots: inputs that say which group a row is of, in the same order.
-        names: of the groups, as the column has them, without that one.
+        names: of these groups, as the column has them, without that one.
         known: value of every group of which it is known.
         known_slots: inputs of these, in the same order.
     """
@@ -90,22 +90,31 @@ def grouping(
     """
     ratio = is_factor(q)
     low, high = spread or (0.0, largest_spread(q))
-    every, slots = (*names, UNSEEN), slot_names(by, names)
-    of_word = dict(zip(every, zip(words(every), slots, strict=True), strict=True))
-    given = {name: ends for name, ends in (known or {}).items() if name in names}
-    others = [name for name in every if name not in given]
-    members = tuple(Quantity(f"{q.name}_of_{of_word[n][0]}", "1", *DELTA, prior="normal", role=MEMBER) for n in others)
+    given = known or {}
+    # a column may have a group that is called as that one
+    every = list(zip((*names, None), words((*names, UNSEEN)), slot_names(by, names), strict=True))
+    others = [(name, word, slot) for name, word, slot in every if name not in given]
+    own_value = [(given[name], word, slot) for name, word, slot in every if name is not None and name in given]
+    members = tuple(Quantity(f"{q.name}_of_{word}", "1", *DELTA, prior="normal", role=MEMBER) for _, word, _ in others)
     own = Quantity(f"{q.name}_spread", "1" if ratio else q.unit, low, high, role=SPREAD)
     values = tuple(
-        Quantity(
-            f"{q.name}_of_{of_word[n][0]}", q.unit, *ends, prior="lognormal" if ratio and ends[0] > 0 else "normal"
-        )
-        for n, ends in given.items()
+        Quantity(f"{q.name}_of_{word}", q.unit, *ends, prior="lognormal" if ratio and ends[0] > 0 else "normal")
+        for ends, word, _ in own_value
     )
     return Grouping(
-        q.name, by, ratio, own, members, tuple(of_word[n][1] for n in others), tuple(others[:-1]),
-        values, tuple(of_word[n][1] for n in given),
+        q.name, by, ratio, own, members, tuple(slot for *_, slot in others), tuple(name for name, *_ in others if name),
+        values, tuple(slot for *_, slot in own_value),
     )  # fmt: skip
+
+
+def groupings(model: Model, groups: Mapping[str, tuple[str, ...]]) -> list[Grouping]:
+    """Return how the parameters of a simulator differ that do, in their order; groups: column -> names."""
+    return [
+        grouping(q, by, groups[by], model.spreads.get(q.name), model.known_groups.get(q.name))
+        for q in model.params
+        for by in [model.per.get(q.name)]
+        if by is not None
+    ]
 
 
 def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
@@ -126,12 +135,7 @@ def grouped(model: Model, groups: dict[str, tuple[str, ...]]) -> Model:
     slots = [name for by, names in groups.items() for name in slot_names(by, names)]
     inputs = [Quantity(name, "1", 0.0, 1.0) for name in slots]
     taken = {q.name for q in (*model.states, *model.inputs, *model.params, *model.outputs)} | model.fixed.keys()
-    every = [
-        grouping(q, by, groups[by], model.spreads.get(q.name), model.known_groups.get(q.name))
-        for q in model.params
-        for by in [model.per.get(q.name)]
-        if by is not None
-    ]
+    every = groupings(model, groups)
     own = [q for each in every for q in each.own]
     for q in (*inputs, *own):
         if q.name in taken:

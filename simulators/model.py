@@ -215,9 +215,10 @@ class Declared:
         inputs: as states, without `periodic`; `delay` and `lag` (s, or the name of a parameter) say how late and how
             slowly an input acts, `between_rows` (held, linear or smooth) what it does from one row to the next.
         parameters: name: a number (known), an expression of other parameters (derived), {unit, value} (known), or
-            {unit, range, prior: uniform|normal|lognormal, per: COLUMN, spread: [low, high]} (uncertain, see `Quantity`; with
-            `per` it differs from group to group, by a `spread` that may have a range, see `simulators.groups`), or {unit,
-            range, column} (known in every row by a column of the measurements, such as a payload).
+            {unit, range, prior: uniform|normal|lognormal, per: COLUMN, spread: [low, high], groups: {name: [low, high]}}
+            (uncertain, see `Quantity`; with `per` it differs from group to group, by a `spread` that may have a range, but in
+            `groups` whose value is known, see `simulators.groups`), or {unit, range, column} (known in every row by a column
+            of the measurements, such as a payload).
         intermediates: name: expression, or {unit, expression}, in states, inputs, parameters, tables and other intermediates,
             in any order; a name that dynamics and outputs can use.
         tables: name: {inputs, method: linear|cubic, unit} with `file` (a CSV) or `axes` and `values`; a name as those of

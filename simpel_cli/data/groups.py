@@ -12,7 +12,7 @@ LEAST = 2  # groups: one tells nothing of a spread
 
 
 def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, ...]]:
-    """Return the groups of the training rows, by column, in order of appearance, and behind them those that a simulator knows.
+    """Return the groups of the training rows, by column, in order of appearance, and others of its rows that a simulator knows.
 
     Args:
         model: that names the columns.
@@ -28,7 +28,7 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
         train = rows.split == "train"
         names = tuple(dict.fromkeys(label for label in labels[train].tolist() if label))
         given = [model.known_groups.get(parameter, {}) for parameter, by in model.per.items() if by == column]
-        if len(names) < LEAST and not any(given):
+        if len(names) < LEAST and not (given and all(given)):
             raise DataError(
                 f"{key}: column '{column}' has {len(names)} group in the training rows"
                 f"{f' ({names[0]})' if names else ''}, which tells nothing of a spread. Leave it out, or train on more "
@@ -41,7 +41,8 @@ def group_names(model: Model, table: Table, rows: Rows) -> dict[str, tuple[str, 
             )
         if rows.next_states.shape[1] == 0:
             _refuse_changes(rows, labels, column, key)
-        found[column] = tuple(dict.fromkeys([*names, *(name for known in given for name in known)]))
+        known = (name for values in given for name in values if name in labels)
+        found[column] = tuple(dict.fromkeys([*names, *known]))
     return found
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
+from scipy.stats import binom
 
 from simpel_cli.dynamics.divergence import divergence_error
 from simpel_cli.dynamics.domain import Domain
@@ -32,6 +33,7 @@ from simulators.worlds.world import World
 NORMALISER_POINTS, NORMALISER_DRAWS = 1000, 64
 WORLD_POINTS, WORLD_DRAWS = 200, 16  # of the normaliser, where a query costs a simulation and not a microsecond
 DEFAULT_GAP_FRACTION = 0.1  # of the outputs' std, in the normaliser, where the simulator declares no gap
+SURE = 0.95  # of the times that a share of `MOST_LOST` passes
 MOST_LOST = 0.05  # share of the draws that may run away: more are no tails of a law, but a simulator that fails
 
 
@@ -82,7 +84,7 @@ class System(NamedTuple):
     def _lost(self, values: np.ndarray) -> int | None:
         """Return how many draws (n, M, dy) ran away; None: too many, and not all values are finite."""
         lost = len(values) - int(followed(values, reach_of(self.encoding)).sum())
-        if lost <= MOST_LOST * len(values):
+        if lost <= binom.ppf(SURE, len(values), MOST_LOST):  # of few draws more may by chance
             return lost
         return 0 if np.isfinite(values).all() else None
 

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from simpel_cli.data import Measurements, Recording, read, transitions
+from simpel_cli.discovery.search.by_group.spreads import other_slots, slots_of
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.dynamics.domain import Domain
 from simpel_cli.dynamics.transition import encoding_of, transition
@@ -133,11 +134,41 @@ def test_a_group_that_is_known_has_its_own_value_whatever_the_population() -> No
     assert spreads_of(every.params) == {}  # nothing tells of the spread
 
 
-def test_what_the_simulator_knows_of_groups_is_known_without_training_rows_of_them(made) -> None:
+def test_what_the_simulator_knows_of_groups_is_known_without_training_rows_of_them(made, tmp_path) -> None:
     path, _ = made
-    first, *others = recorded(path, slider(per="ball")).groups["ball"]
-    data = recorded(path, slider(per="ball", groups={"elsewhere": [1.0, 2.0], first: [1.0, 2.0]}))
-    assert data.groups["ball"] == (first, *others, "elsewhere")
+    table = pd.read_parquet(path)
+    first, *others, last = recorded(path, slider(per="ball")).groups["ball"]
+    table.loc[table["ball"] == last, "split"] = "test"
+    file = tmp_path / "runs.parquet"
+    table.to_parquet(file)
+    known = {"elsewhere": [1.0, 2.0], first: [1.0, 2.0], last: [1.0, 2.0]}
+    assert recorded(file, slider(per="ball", groups=known)).groups["ball"] == (first, *others, last)
+    assert recorded(file, slider(per="ball")).groups["ball"] == (first, *others)
+
+
+def test_a_search_knows_some_groups_and_learns_the_others(made) -> None:
+    path, truth = made
+    (first, own), *others = truth.items()
+    model = slider(per="ball", groups={first: [0.9 * own["c"], 1.1 * own["c"]]})
+    data = recorded(path, model)
+    whole = grouped(model, data.groups)
+    values, _, _ = fitted(whole, data)
+    assert values[f"c_of_{first}"] == pytest.approx(own["c"], rel=0.05)
+    for name, each in others:
+        assert values["c"] * np.exp(values["c_spread"] * values[f"c_of_{name}"]) == pytest.approx(each["c"], rel=0.05)
+    plan = setup(whole, data, (), [], 2)
+    inputs = [q.name for q in whole.inputs]
+    rows = {q.name: i for i, q in enumerate(whole.params)}
+    expected = {rows[f"c_of_{name}"]: inputs.index(f"ball_is_{name}") for name, _ in others}
+    assert slots_of(plan, spreads_of(whole.params)) == expected
+    assert other_slots(plan) == {rows["c_spread"]: inputs.index("ball_is_another")}
+
+
+def test_a_group_may_be_called_another() -> None:
+    whole = grouped(slider(per="ball"), {"ball": (UNSEEN, "b")})
+    assert len({q.name for q in whole.params}) == len(whole.params) == 6
+    known = grouped(slider(per="ball", groups={UNSEEN: [1.0, 2.0]}), {"ball": ("a", "b")})
+    assert len(known.params) == 6  # which is no group of these data
 
 
 def test_an_identified_simulator_begins_with_what_is_known_of_groups(made) -> None:

@@ -15,7 +15,7 @@ from simpel_cli.filtering.errors_ahead import _free
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.sensor_delay import JUMPS
 from simpel_cli.filtering.likelihood.track import Noise
-from simpel_cli.filtering.setup import Setup, setup
+from simpel_cli.filtering.setup import Setup, questions, setup
 from simulators.effects import Expression
 from simulators.model import Declared
 from simulators.quantity import Quantity
@@ -128,21 +128,25 @@ def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> 
 
 
 @pytest.mark.parametrize(
-    ("between", "arrives"), [("held", 0.0), ("linear", 0.0), ("held", 0.5), ("held", 0.375), ("held", 1.25)]
+    ("between", "arrives"),
+    [("held", 0.0), ("linear", 0.0), ("held", 0.5), ("held", 0.375), ("held", 1.25), ("asked", 0.5)],
 )
 @pytest.mark.parametrize(("late", "lag"), [(0.0, 0.06), (0.06, 0.0), (0.1, 0.1), (0.3, 0.0), (0.25, 0.1)])
 def test_late_sensors_remember_that_the_input_jumped(late: float, lag: float, between: str, arrives: float) -> None:
     """With a slow model, whose rates are those of the input: the reading is the input's integral, delayed and lagged.
 
     Where inputs go straight from a row to the next, their slopes jump; one that is late itself, by so many rows, jumps within
-    a row. A simulation shows the same.
+    a row, also where it is asked whether it is held. A simulation shows the same.
     """
+    asked, between = between == "asked", "held" if between == "asked" else between
     effects = [
         Expression(kind, acts_on=on, operator=kind, parameters={"t": {"range": [0.0, 1.0], "unit": "s"}})
         for kind, on in (("sensor_delay", "v"), ("sensor_lag", "v"), ("delay", "u"))
     ]
     effects = effects[: 3 if arrives else 2]
-    plan = setup(replace(model(), between_rows={"u": between}), recording(), (), effects, 8 if arrives else 2)
+    held_or_not = replace(model(), between_rows={} if asked else {"u": between})
+    extra = questions(held_or_not) if asked else ()
+    plan = setup(held_or_not, recording(), (), effects, 8 if arrives else 2, extra=extra)
     names = [q.name for q in plan.augmented.params]
     p = p_of_plan(plan, 1e-9, 1.0)
     p[names.index("sensor_delay_v_t")], p[names.index("sensor_lag_v_t")] = late, lag

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from simpel_cli.discovery.search.budget import Budget
-from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, respread, slots_of
+from simpel_cli.discovery.search.by_group.spreads import BEGIN, Spreading, other_slots, respread, slots_of
 from simpel_cli.discovery.search.score_test import Score, promises
 from simpel_cli.errors import DataError
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
@@ -93,7 +93,7 @@ class Search:
         differing = [plan.augmented.spreads(t) for t in self.terms]
         self.members = [tuple(i for own in each.values() for i in own[:-1]) for each in differing]
         self.spreads = every | {row: own[:-1] for each in differing for row, own in each.items()}
-        self.slot_of = slots_of(plan, every)
+        self.slot_of, self.other_slots = slots_of(plan, every), other_slots(plan)
         self.spreads_of = [tuple(each) for each in differing]
         inner = fitter.fitter if isinstance(fitter, Spreading) else fitter
         self.fitter = Spreading(inner, self.spreads) if self.spreads else inner

@@ -90,9 +90,10 @@ def corrected(sim: dict[str, Any], model: Model, search: Search, trial: Trial) -
             if row in spread and low < high:
                 ends = spread_of(search, trial, spread[row], Z95)
                 parameters[short] |= {"per": spread[row].how.by, "spread": [ends["low"], ends["high"]]}
-                values = values_of(search, trial, spread[row], SHARE).items()
                 parameters[short]["groups"] = {
-                    name: [v["low"], v["high"]] for name, v in values if v["low"] < v["high"]
+                    name: law_of(v["low"], v["high"], signed=parameter.low < 0, log=v["low"] > 0)["range"]
+                    for name, v in values_of(search, trial, spread[row], SHARE).items()
+                    if v["low"] < v["high"]
                 }
     node = (_declared if plain else _extended)(sim, name, written, names, parameters)
     if plain and search.plan.substeps > int(sim.get("substeps", Declared.substeps)):

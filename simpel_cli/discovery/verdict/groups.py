@@ -7,7 +7,7 @@ import numpy as np
 from simpel_cli.discovery.search.by_group.spreads import known
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis
-from simulators.groups import Grouping, grouping
+from simulators.groups import Grouping, groupings
 
 DRAWS = 4000  # of the posterior, for the interval of a value per group
 Z90 = 1.6448536269514722
@@ -45,12 +45,8 @@ def differing(search: Search, trial: Trial) -> list[Differing]:
     augmented = search.plan.augmented
     names = [q.name for q in augmented.params]
     model = augmented.model
-    found: list[tuple[Grouping, str, str, str]] = []
-    for q in model.base.params if model.base else ():
-        if q.name in model.per:
-            by = model.per[q.name]
-            how = grouping(q, by, model.groups[by], model.spreads.get(q.name), model.known_groups.get(q.name))
-            found += [(how, q.name, "", "")] if how.names else []
+    of_simulator = groupings(model.base, model.groups) if model.base else []
+    found = [(how, how.parameter, "", "") for how in of_simulator if how.names]
     for t in trial.terms:
         term = search.terms[t]
         labels = {k.name: k.label for k in term.parameters}

@@ -157,7 +157,6 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     late_ones = bool(sensor_delays or sensor_lags or any(own_delays) or any(own_lags))
     # an input that is late itself makes a motion jump within a row
     parts = substeps if may_be_late(augmented) else 1
-    smooth_since = 0 if parts == 1 or linear else substeps - 1  # the substep of a row from which on a motion is smooth
 
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
@@ -195,7 +194,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             slope = slope_back(early, prompt, rate_x)
         if late_ones:
             d, tau = late_by(p)
-            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt / parts)
+            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt, parts)
             slope = slope - (d + tau)[:, None] * product(prompt, rate_x)
         return read, slope, prompt
 
@@ -246,9 +245,8 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
             motion = moving_in(p, following, u_k[-1], rate_after, rate_x_after)
             if late_ones:
-                at = smooth_since, 0
-                begun = moving_in(p, stages[at], u_k[smooth_since], stage_rate[at], stage_x[at])
-                motion = motion.since(begun, (substeps - smooth_since) * length(u_k[-1, -1]))
+                begun = moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p))
+                motion = motion.since(begun, dt if pace is None else dt * pace[None])
                 if parts > 1:
                     # where the last stage of a substep was is not quite its end
                     ends = jax.vmap(applied)(stage_x[:-1, 2], stages[1:, 0] - stages[:-1, 2]) + stage_rate[:-1, 2]
@@ -294,11 +292,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
         if late_ones:
             (d, tau), motion = late_by(p), moving_in(p, x, u_before[-1], *rates(x, end, p))
-            h = (substeps - smooth_since) * length(end)
-            at = x - h * motion.rate + h**2 / 2 * motion.bend if smooth_since else x_before
-            first = u_before[smooth_since]
-            motion = motion.since(moving_in(p, at, first, *rates(at, first[0], p)), h)
-            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt / parts)
+            begun = moving_in(p, x_before, u_before[0], *rates(x_before, u_before[0, 0], p))
+            motion = motion.since(begun, dt if pace is None else dt * pace[None])
+            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt, parts)
             going = moving_in(p, x, u[0], *rates(x, u[0, 0], p))
             jumps = pushed(jumps, slope, motion, going)
             if parts > 1:

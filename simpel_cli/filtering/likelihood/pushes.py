@@ -125,9 +125,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
 
             def shown(late: tuple[Array, Array]) -> Array:
                 assert held.jumps is not None
-                return jnp.sum(held.prompt * back(*late, held.motion), axis=1) + still_shown(
-                    *late, held.jumps, dt / timing.parts
-                )
+                smooth = jnp.sum(held.prompt * back(*late, held.motion), axis=1)
+                return smooth + still_shown(*late, held.jumps, dt, timing.parts)
 
             reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
 

@@ -80,7 +80,26 @@ def no_jumps(ny: int, x: Float[Array, "nx ..."], count: int = JUMPS) -> Float[Ar
 
 
 def still_shown(
-    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], jumps: Float[Array, "K orders ny ..."], step: float
+    d: Float[Array, "ny ..."],
+    tau: Float[Array, "ny ..."],
+    jumps: Float[Array, "K orders ny ..."],
+    dt: float,
+    parts: int = 1,
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its motion jumped; jumps: one a step, the latest first."""
-    return echo(d, tau, jumps, ages(len(jumps), step, d.dtype))
+    """Return what every sensor still shows of the time before its motion jumped.
+
+    Args:
+        d: delay, s.
+        tau: lag, s.
+        jumps: between so many parts of every row, the latest first.
+        dt: distance of the rows, s.
+        parts: of a row; what jumped within the last one is in the difference that `Motion.since` takes for a rest, and is
+            taken out of it.
+    """
+    ago = ages(len(jumps), dt / parts, d.dtype)
+    shown = echo(d, tau, jumps, ago)
+    if parts == 1:
+        return shown
+    share = (0.5 - ago[: parts - 1] / dt).reshape(-1, *(1,) * d.ndim)
+    no_rest = jnp.sum(jumps[: parts - 1, 2] * share - jumps[: parts - 1, 1] / dt, axis=0)
+    return shown + signed_moments(d, tau)[2] * no_rest

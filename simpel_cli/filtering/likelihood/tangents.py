@@ -31,7 +31,7 @@ from simpel_cli.filtering.likelihood.clock import early_of
 from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import SMALL, Timing
-from simpel_cli.filtering.likelihood.sensor_delay import Motion, back, moving, pushed, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, Motion, back, moving, pushed, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
@@ -53,7 +53,7 @@ class _Moved(NamedTuple):
         state: (nx, ...).
         cov: (nx, nx, ...).
         motion: at the end of the row before.
-        jumps: of what the sensors read.
+        jumps: of what the sensors read, at rows; those within rows are in the pushes.
         begin: state and rate at the row before.
         bent: slope of the rates at the end of the row before, as far as the state there moves it.
     """
@@ -110,7 +110,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
             nothing,
             square if follows else (),
             motion,
-            () if rows.held.jumps is None else jnp.zeros_like(rows.held.jumps[0]),
+            () if rows.held.jumps is None else jnp.zeros_like(rows.held.jumps[0, :JUMPS]),
             (-dt * rate, rate) if uneven else (),
             square if uneven and rows.ways.turn is not None else (),
         )

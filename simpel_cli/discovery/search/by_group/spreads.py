@@ -15,7 +15,7 @@ from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hopes, Hypothesis,
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.priors.spreads import LEAST, factor_of, sd_of_log
-from simulators.groups import SPREAD, slot_names
+from simulators.groups import groupings
 
 BEGIN = 0.35  # of the largest spread, where a fit begins
 ROUNDS = 4  # of fits with another spread
@@ -159,15 +159,19 @@ def slots_of(plan: Setup, own: Mapping[int, Sequence[int]]) -> dict[int, int]:
     """Return what every group is -> the input that says that a row is of it."""
     model = plan.augmented.model
     inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
-    found = {
-        names.index(q.name): inputs.index(slot)
-        for term in plan.augmented.terms
-        for g in term.groupings
-        for q, slot in zip(g.members, g.slots, strict=True)
-    }
-    columns = {f"{name}_{SPREAD}": by for name, by in model.base.per.items()} if model.base else {}
-    for spread, rows in own.items():
-        by = columns[model.params[spread].name]
-        slots = slot_names(by, model.groups[by])[:-1]  # without the group that was never seen
-        found |= {row: inputs.index(slot) for row, slot in zip(rows, slots, strict=True)}
+    every = [g for term in plan.augmented.terms for g in term.groupings]
+    found = {names.index(q.name): inputs.index(slot) for g in every for q, slot in zip(g.members, g.slots, strict=True)}
+    for g in groupings(model.base, model.groups) if model.base else ():
+        if names.index(g.spread.name) in own:  # without the group that was never seen
+            seen = zip(g.members[:-1], g.slots[:-1], strict=True)
+            found |= {names.index(q.name): inputs.index(slot) for q, slot in seen}
     return found
+
+
+def other_slots(plan: Setup) -> dict[int, int]:
+    """Return every spread -> the input that says that a row is of none of the groups."""
+    model = plan.augmented.model
+    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
+    every = [g for term in plan.augmented.terms for g in term.groupings]
+    every += groupings(model.base, model.groups) if model.base else []
+    return {names.index(g.spread.name): inputs.index(g.slots[-1]) for g in every}

@@ -62,6 +62,6 @@ def _differing(search: Search, trial: Trial) -> list[int]:
 
 
 def _unseen(search: Search, spread: int, windows: Windows) -> np.ndarray:
-    """Return which windows are of none of the groups that were fitted, (W,)."""
-    slots = [search.slot_of[row] for row in search.spreads[spread] if row in search.slot_of]
-    return ~(windows.u[:, -1, slots] == 1).any(axis=1)
+    """Return which windows are of none of the groups that were fitted, or are known, (W,)."""
+    here: np.ndarray = windows.u[:, -1, search.other_slots[spread]] == 1
+    return here
