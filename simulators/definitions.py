@@ -141,12 +141,10 @@ def read_groupings(
         if isinstance(node, Mapping) and "groups" in node:
             path = f"sim.parameters.{name}.groups"
             check_mapping(path, node["groups"])
-            known[name] = {
-                str(group): read_range(f"{path}.{group}", {"range": ends}) for group, ends in node["groups"].items()
-            }
+            known[name] = {str(group): read_range(path, node["groups"], group) for group in node["groups"]}
         if isinstance(node, Mapping) and "spread" in node:
             path = f"sim.parameters.{name}.spread"
-            low, high = read_range(path, {"range": node["spread"]})
+            low, high = read_range(f"sim.parameters.{name}", node, "spread")
             if low < 0:
                 raise ModelError(f"{path}: low = {low:g} is negative, and a standard deviation is not; give 0 or more")
             spreads[name] = (low, high)

@@ -129,17 +129,17 @@ def read_term(path: str, formula: Any, scope: Mapping[str, Symbol]) -> Symbol:
         raise ModelError(f"{path}: {error}") from None
 
 
-def read_range(path: str, node: Mapping[str, Any]) -> tuple[float, float]:
-    """Read `range: [low, high]`."""
-    if "range" not in node:
-        raise ModelError(f"{path}: no range; add `range: [low, high]`")
-    ends = node["range"]
+def read_range(path: str, node: Mapping[str, Any], key: str = "range") -> tuple[float, float]:
+    """Read `range: [low, high]`, or another key that holds a range."""
+    if key not in node:
+        raise ModelError(f"{path}: no {key}; add `{key}: [low, high]`")
+    ends = node[key]
     if not isinstance(ends, (list, tuple)) or len(ends) != 2:
-        raise ModelError(f"{path}.range: {ends!r} is not a range; write [low, high]")
-    low, high = (read_number(f"{path}.range", end) for end in ends)
+        raise ModelError(f"{path}.{key}: {ends!r} is not a range; write [low, high]")
+    low, high = (read_number(f"{path}.{key}", end) for end in ends)
     if low >= high:
         cure = "swap them" if low > high else "give low < high"
-        raise ModelError(f"{path}.range: low = {low:g} is not below high = {high:g}; {cure}")
+        raise ModelError(f"{path}.{key}: low = {low:g} is not below high = {high:g}; {cure}")
     return low, high
 
 

@@ -199,7 +199,7 @@ def test_what_is_wrong_is_said(made, tmp_path) -> None:
         ModelError, match=r"sim.parameters.c.groups: only of a parameter that differs .* add `per: COLUMN`"
     ):
         slider(groups={"a": [1, 2]})
-    with pytest.raises(ModelError, match=r"sim.parameters.c.groups.a.range: low = 2 is not below high = 1; swap them"):
+    with pytest.raises(ModelError, match=r"sim.parameters.c.groups.a: low = 2 is not below high = 1; swap them"):
         slider(per="ball", groups={"a": [2, 1]})
     with pytest.raises(ModelError, match=r"sim.parameters.c.groups: 3 is not a mapping"):
         slider(per="ball", groups=3)
