@@ -209,8 +209,9 @@ def reach_of(encoding: Encoding) -> np.ndarray:
 
 def followed(draws: Array | np.ndarray, reach: np.ndarray | float) -> Array:
     """Return which draws (n, M, dy) the integration followed, (n,): finite, and within reach, everywhere."""
+    draws = jnp.asarray(draws)  # before its kind of number is asked for: doubles may become singles here
     most = jnp.minimum(jnp.asarray(reach, draws.dtype), jnp.finfo(draws.dtype).max)
-    return jnp.all(jnp.abs(jnp.asarray(draws)) <= jnp.reshape(most, (1, 1, -1)), axis=(1, 2))
+    return jnp.all(jnp.abs(draws) <= jnp.reshape(most, (1, 1, -1)), axis=(1, 2))
 
 
 def instead_of_lost(draws: Array | np.ndarray, reach: np.ndarray | float) -> Array:

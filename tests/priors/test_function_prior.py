@@ -141,3 +141,10 @@ def test_gp_prior_has_no_simulator_part() -> None:
 def test_wrong_declarations(build: object, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build()  # type: ignore[operator]
+
+
+def test_infinity_is_lost_in_either_precision() -> None:
+    draws = np.array([[[1.0]], [[np.inf]], [[2.0]]])
+    for enabled in (True, False):
+        with jax.enable_x64(enabled):
+            np.testing.assert_array_equal(followed(draws, np.inf), [True, False, True])

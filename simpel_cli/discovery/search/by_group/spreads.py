@@ -15,7 +15,7 @@ from simpel_cli.filtering.likelihood.fit import MOST, Fitter, Hopes, Hypothesis,
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.priors.spreads import LEAST, factor_of, sd_of_log
-from simulators.groups import groupings
+from simulators.groups import Grouping, groupings
 
 BEGIN = 0.35  # of the largest spread, where a fit begins
 ROUNDS = 4  # of fits with another spread
@@ -157,11 +157,12 @@ def respread(
 
 def slots_of(plan: Setup, own: Mapping[int, Sequence[int]]) -> dict[int, int]:
     """Return what every group is -> the input that says that a row is of it."""
-    model = plan.augmented.model
-    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
-    every = [g for term in plan.augmented.terms for g in term.groupings]
-    found = {names.index(q.name): inputs.index(slot) for g in every for q, slot in zip(g.members, g.slots, strict=True)}
-    for g in groupings(model.base, model.groups) if model.base else ():
+    inputs, names = _names(plan)
+    of_effects, of_simulator = _groupings(plan)
+    found = {
+        names.index(q.name): inputs.index(slot) for g in of_effects for q, slot in zip(g.members, g.slots, strict=True)
+    }
+    for g in of_simulator:
         if names.index(g.spread.name) in own:  # without the group that was never seen
             seen = zip(g.members[:-1], g.slots[:-1], strict=True)
             found |= {names.index(q.name): inputs.index(slot) for q, slot in seen}
@@ -170,8 +171,17 @@ def slots_of(plan: Setup, own: Mapping[int, Sequence[int]]) -> dict[int, int]:
 
 def other_slots(plan: Setup) -> dict[int, int]:
     """Return every spread -> the input that says that a row is of none of the groups."""
+    inputs, names = _names(plan)
+    return {names.index(g.spread.name): inputs.index(g.slots[-1]) for of in _groupings(plan) for g in of}
+
+
+def _names(plan: Setup) -> tuple[list[str], list[str]]:
+    """Return the names of inputs, and of parameters."""
+    return [q.name for q in plan.augmented.model.inputs], [q.name for q in plan.augmented.params]
+
+
+def _groupings(plan: Setup) -> tuple[list[Grouping], list[Grouping]]:
+    """Return how parameters of effects differ between groups, and how those of the simulator do."""
     model = plan.augmented.model
-    inputs, names = [q.name for q in model.inputs], [q.name for q in plan.augmented.params]
-    every = [g for term in plan.augmented.terms for g in term.groupings]
-    every += groupings(model.base, model.groups) if model.base else []
-    return {names.index(g.spread.name): inputs.index(g.slots[-1]) for g in every}
+    of_effects = [g for term in plan.augmented.terms for g in term.groupings]
+    return of_effects, groupings(model.base, model.groups) if model.base else []
