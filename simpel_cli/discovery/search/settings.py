@@ -20,7 +20,7 @@ class Discovery:
         first_rows: rows of an episode from which the state is estimated that its free run begins with; errors of the free run
             are those of the rows behind.
         substeps: Runge-Kutta steps per row in the filter; null = as many as the noise asks for, 8 at most.
-        lanes: fits that run side by side in the compiled program.
+        lanes: fits that run side by side in the compiled program, at most; fewer where there are many windows.
         room: unknowns of effects that a hypothesis can have at once; time grows with it.
         rows: training rows that a search looks at, evenly spaced windows of a longer record; errors are of all test rows.
         pairs: whether a named effect has to beat functions of two arguments, too; a search then takes about twice as long.

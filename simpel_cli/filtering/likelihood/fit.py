@@ -36,6 +36,7 @@ ROUND = 4  # iterations after which fits that have arrived make room for others
 SLOW = 0.1  # nats: a round that gains less, with a step that helped at its end, ends a fit that crawls along a valley
 LEGS = 8  # of a step, between which unknowns meet the ends of their ranges
 FIRST_DAMPING = 1e-2
+POINTS = 16  # windows of all fits of one program: of more, what a row leaves behind does not stay in the cache
 
 
 class Hypothesis(NamedTuple):
@@ -114,7 +115,7 @@ class Course(NamedTuple):
 
 
 class Fitter:
-    """Fits hypotheses; one compiled program for a batch of `side_by_side`, with up to `width` free unknowns each.
+    """Fits hypotheses; one compiled program for a batch of at most `side_by_side`, with up to `width` free unknowns each.
 
     Batches run on as many threads as there are cores. After a few iterations the fits that have arrived make room for
     those that wait, always in the same order: a result does not depend on the number of threads. `watch` is told before every
@@ -126,7 +127,8 @@ class Fitter:
     def __init__(
         self, rule: Filter, coordinates: Coordinates, windows: Windows, *, side_by_side: int = 4, width: int = 16
     ) -> None:
-        self.coordinates, self.windows, self.side_by_side, self.width = coordinates, windows, side_by_side, width
+        self.coordinates, self.windows, self.width = coordinates, windows, width
+        self.side_by_side = max(1, min(side_by_side, POINTS // len(windows.episode)))
         self._data = tuple(jnp.moveaxis(a, 0, -1) for a in windows.arrays)
         self._program = _program(rule, coordinates.layout)
         self._bounds = tuple(jnp.asarray(a) for a in coordinates.bounds)
