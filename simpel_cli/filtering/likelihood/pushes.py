@@ -56,13 +56,16 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
     def pushes(p: Array, rows: Array, at: Track, held: Held, u: Array) -> tuple[Ways, Pushes]:
         sure = sure_of(at.variance)
         units = jax.vmap(lambda row: _unit(p, row))(_at_each(rows, p))
-        moved = moved_before = None
-        asked = jnp.asarray(False)
+        asked = moved = moved_before = None
         if timing.of_inputs:
-            asked = jnp.isin(rows, jnp.array(timing.of_inputs)).any()
-            moved = jnp.moveaxis(
-                where_asked(asked, lambda: _along(lambda q: timing.inputs(q, u)[:, :, :, :nu], p, units)), 1, 0
-            )
+            asked = jnp.isin(rows, jnp.array(timing.of_inputs)).reshape(len(rows), -1).any(axis=1)
+
+            def arriving(direction: tuple[Array, Array]) -> Array:
+                ask, unit = direction
+                along = lambda unit: jax.jvp(lambda q: timing.inputs(q, u)[:, :, :, :nu], (p,), (unit,))[1]  # noqa: E731
+                return where_asked(ask, along, unit)
+
+            moved = jnp.moveaxis(_of_each(arriving, (asked, units), _count(rows, p)), 1, 0)
             moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
         at_rows = lambda a: jnp.expand_dims(a, a.ndim - p.ndim + 1)  # noqa: E731
         late = None if late_by is None else jax.tree.map(at_rows, (late_by(p), _along(late_by, p, units)))
@@ -81,14 +84,15 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             found = found._replace(reading=found.reading + _since(within))
         if found.bent is not None:
             assert bend is not None
-            begin = at.predicted[0], before[0], None if moved_before is None else moved_before[0]
-            start = _pushed(bend, p, rows, *begin, asked)
-            found = found._replace(bent=jnp.concatenate([start.reshape(1, *found.bent.shape[1:]), found.bent[:-1]]))
+            start = _pushed(bend, p, at.predicted[0], before[0], asked)
+            first = None if moved_before is None else moved_before[0]
+            begin = _of_each(lambda each: start(*each), (rows, asked, first), _count(rows, p))
+            found = found._replace(bent=jnp.concatenate([begin.reshape(1, *found.bent.shape[1:]), found.bent[:-1]]))
         return ways, found
 
     def _of_rows(
-        p: Array, rows: Array, asked: Array, late: Any, sure: Array, predicted: Array, held: Held, before: Array, moved: Any,
-        moved_before: Any,
+        p: Array, rows: Array, asked: Array | None, late: Any, sure: Array, predicted: Array, held: Held, before: Array,
+        moved: Any, moved_before: Any,
     ) -> tuple[Ways, Pushes, Array | None]:  # fmt: skip
         """Do so for rows, the first axis of the points; `moved`: (D, substeps, K, nu, ...) how the inputs change.
 
@@ -99,47 +103,60 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         moved_s = None
         if moved is not None:
             moved_s = jnp.moveaxis(moved[:, :, _stages_of(moved.shape[2])], 3, 1)
-        push = _pushed(rates, p, rows, x_s, u_s, moved_s, asked)
         by_x = jnp.moveaxis(held.stage_x, (2, 3), (0, 1))
         h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
-        state = jax.vmap(lambda g: _composed(by_x, g, h, sure))(push)
-
-        first_of = lambda a: None if a is None else a[:, :, 0, 0]  # noqa: E731
         early = early_of(held.u[0, 0], nu)
-        first = now = end = push_first = push_now = push_end = None
-        if late is not None or early is not None:
-            begin = predicted, u_s[:, 0, 0]
-            push_now = _pushed(rates, p, rows, *begin, first_of(moved_s), asked)
+        begin = predicted, u_s[:, 0, 0]
+        push_of, reading_of = _pushed(rates, p, x_s, u_s, asked), _pushed(sensors, p, *begin, asked)
+        moves = late is not None or early is not None
+        first = now = end = None
+        if moves:
+            now_of = _pushed(rates, p, *begin, asked)
             first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
-            push_first, push_end = push[:, :, 0, 0], push[:, :, -1, -1]
-        within = None
-        if late is not None and timing.parts > 1:
-            assert end is not None
-            changes = jnp.moveaxis(push[:, :, 1:, 0] - push[:, :, :-1, 2], 2, 1)
-            within = jax.vmap(lambda change: _still_to_be_shown(late[0], held.prompt, change, end))(changes)
-        reading = _pushed(sensors, p, rows, predicted, u_s[:, 0, 0], first_of(moved_s), asked)
-        if early is not None:
-            then = _pushed(sensors, p, rows, predicted, before, moved_before, asked)
-            reading = jax.vmap(lambda a, b: chosen(early, a, b))(then, reading)
+        then_of = None if early is None else _pushed(sensors, p, predicted, before, asked)
+        turned_of = None if bend is None else _pushed(bend, p, _ends(x_s), _ends(u_s), asked)
         if late is not None:
+            some_late = jnp.any(late[0][0] > 0) | jnp.any(late[0][1] > 0)
+            some_jump = jnp.any(held.u[1:, 0, :nu] != held.u[:-1, -1, :nu])
 
-            def shown(late: tuple[Array, Array]) -> Array:
-                assert held.jumps is not None
-                smooth = jnp.sum(held.prompt * back(*late, held.motion), axis=1)
-                return smooth + still_shown(*late, held.jumps, dt, timing.parts)
+        def shown(late: tuple[Array, Array]) -> Array:
+            assert held.jumps is not None
+            smooth = jnp.sum(held.prompt * back(*late, held.motion), axis=1)
+            return smooth + still_shown(*late, held.jumps, dt, timing.parts)
 
-            reading = reading + jax.vmap(lambda d: jax.jvp(shown, (late[0],), (d,))[1])(late[1])
+        def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
+            row, ask, moved, moved_before, slower = direction
+            at_first = None if moved is None else moved[:, 0, 0]
+            push = push_of(row, ask, moved)
+            reading = reading_of(row, ask, at_first)
+            if then_of is not None:
+                reading = chosen(early, then_of(row, ask, moved_before), reading)
+            within = None
+            if late is not None:
+                asks = jnp.any(slower[0] != 0) | jnp.any(slower[1] != 0)
+                reading = reading + where_asked(asks, lambda d: jax.jvp(shown, (late[0],), (d,))[1], slower)
+                if timing.parts > 1:
+                    jumps = some_jump if ask is None else some_jump | ask
+                    change = jnp.moveaxis(push[:, 1:, 0] - push[:, :-1, 2], 1, 0)
+                    show = lambda change: _still_to_be_shown(late[0], held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
+                    within = where_asked(some_late & jumps, show, change)
+            turn = bent = None
+            if turned_of is not None:
+                ends = None if moved is None else _ends(moved)
+                turned = turned_of(row, ask, ends)
+                square = turned.reshape(nx, nx, *turned.shape[1:])
+                turn, bent = (square[:, :, 0] + square[:, :, 1]) / 2, None if early is None else square[:, :, 1]
+            end = _composed(by_x, push, h, sure)
+            if not moves:
+                return Pushes(end, reading, None, None, None, turn, bent), within
+            return Pushes(end, reading, push[:, 0, 0], now_of(row, ask, at_first), push[:, -1, -1], turn, bent), within
 
-        turn = push_turn = push_bent = None
+        directions = (rows, asked, moved_s, moved_before, None if late is None else late[1])
+        found, within = _of_each(one, directions, _count(rows, p))
+        turn = None
         if bend is not None:
-            moved_ends = None if moved_s is None else jax.vmap(_ends)(moved_s)
-            turned = _pushed(bend, p, rows, _ends(x_s), _ends(u_s), moved_ends, asked)
-            squares = turned.reshape(len(rows), nx, nx, *turned.shape[2:])
             turn = _slopes(bend, p, _ends(x_s), _ends(u_s)).by_x
             turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
-            push_turn = (squares[:, :, :, 0] + squares[:, :, :, 1]) / 2
-            push_bent = squares[:, :, :, 1] if early is not None else None
-        found = Pushes(state, reading, push_first, push_now, push_end, push_turn, push_bent)
         return Ways(first, now, end, turn), found, within
 
     def _still_to_be_shown(late: tuple[Array, Array], prompt: Array, change: Array, rate_x: Array) -> Array:
@@ -169,62 +186,86 @@ def _slopes(of: Differentiated, p: Array, x: Array, u: Array) -> Slopes:
     return of.slopes(x, u, jnp.broadcast_to(_beside(p, x), (len(p), *x.shape[1:])))
 
 
-def _pushed(of: Differentiated, p: Array, rows: Array, x: Array, u: Array, moved: Array | None, asked: Array) -> Array:
-    """Return what every direction adds, (D, n, ...), at such points.
+def _pushed(
+    of: Differentiated, p: Array, x: Array, u: Array, asked: Array | None
+) -> Callable[[Array, Array | None, Array | None], Array]:
+    """Return what a direction adds at such points: (its row, whether inputs move in it, how, (nu, ...)) -> (n, ...).
 
     Args:
         of: the function.
         p: parameters.
-        rows: directions (see `Filter`).
         x: states.
         u: inputs.
-        moved: (D, nu, ...) how these change; None: they do not.
-        asked: whether they do in any direction.
+        asked: (D,) whether inputs move in a direction; None: they never do.
     """
-    found = _along_rows(of, rows, x, u, _beside(p, x))
-    if moved is None:
-        return found
+    along = _along_rows(of, x, u, _beside(p, x))
+    if asked is None:
+        return lambda row, ask, moved: along(row)
+    by_u = where_asked(asked.any(), lambda: _slopes(of, p, x, u).by_u)
 
-    def by_inputs() -> Array:
-        by_u = _slopes(of, p, x, u).by_u
-        return jax.vmap(lambda d: applied(by_u, d))(moved)
+    def one(row: Array, ask: Array | None, moved: Array | None) -> Array:
+        assert ask is not None
+        return along(row) + where_asked(ask, lambda moved: applied(by_u, moved), moved)
 
-    return found + where_asked(asked, by_inputs)
+    return one
 
 
 def _beside(p: Array, x: Array) -> Array:
     return p.reshape(len(p), *(1,) * (x.ndim - p.ndim), *p.shape[1:])
 
 
-def _along_rows(of: Differentiated, rows: Array, x: Array, u: Array, p: Array) -> Array:
-    """Derivatives in p[row] for each of rows, (D, n, ...), or (D, L) of which each is for a part of the last axis.
+def _along_rows(of: Differentiated, x: Array, u: Array, p: Array) -> Callable[[Array], Array]:
+    """Return derivatives in p[row], (n, ...), of a row, or of (L,) rows of which each is for a part of the last axis.
 
     The points of a part share their parameters.
     """
     if current_device().platform != "cpu":  # there a branch would wait for the host
-        return _picked(of.every(x, u, p), of.place(rows))
-    if rows.ndim == 1:
-        return jax.lax.map(lambda row: of.along(row, x, u, p), rows)
-    parts = rows.shape[1]
-    given = [jnp.moveaxis(a.reshape(*a.shape[:-1], parts, a.shape[-1] // parts), -2, 0) for a in (x, u, p)]
-    given[2] = given[2][..., :1]  # numbers: what is made of them alone is made once
+        table = of.every(x, u, p)
+        return lambda row: _picked(table, of.place(row))
 
-    def one(at: tuple[Array, Array]) -> Array:
-        row, part = at
-        return of.along(row, *(jax.lax.dynamic_index_in_dim(a, part, keepdims=False) for a in given))
+    def along(row: Array) -> Array:
+        if row.ndim == 0:
+            return of.along(row, x, u, p)
+        cut = [a.reshape(*a.shape[:-1], len(row), a.shape[-1] // len(row)) for a in (x, u, p)]
+        cut[2] = cut[2][..., :1]  # numbers: what is made of them alone is made once
 
-    which = jnp.broadcast_to(jnp.arange(parts), rows.shape)
-    found = jax.lax.map(one, (rows.ravel(), which.ravel()))
-    found = jnp.moveaxis(found.reshape(*rows.shape, *found.shape[1:]), 1, -2)
-    return found.reshape(*found.shape[:-2], x.shape[-1])
+        def one(at: tuple[Array, Array]) -> Array:
+            row, part = at
+            return of.along(row, *(jax.lax.dynamic_index_in_dim(a, part, a.ndim - 2, keepdims=False) for a in cut))
+
+        found = jnp.moveaxis(jax.lax.map(one, (row, jnp.arange(len(row)))), 0, -2)
+        return found.reshape(*found.shape[:-2], x.shape[-1])
+
+    return along
 
 
-def _picked(table: Array, rows: Array) -> Array:
-    """Return the entries of a table, (J, n, ...), that stand in rows, (D,), or (D, L), each for a part of the last axis."""
-    if rows.ndim == 1:
-        return table[rows]
-    cut = table.reshape(*table.shape[:-1], rows.shape[1], table.shape[-1] // rows.shape[1])
-    found = jax.vmap(lambda part, row: part[row], in_axes=(-2, 1), out_axes=-2)(cut, rows)
+def _of_each(function: Callable[[Any], Any], directions: Any, count: Array) -> Any:
+    """Apply a function of a direction to the first ones, of which each moves something; of the others: zeros."""
+    if current_device().platform != "cpu":
+        return jax.vmap(function)(directions)
+    shapes = jax.eval_shape(function, jax.tree.map(lambda a: a[0], directions))
+    total = len(jax.tree.leaves(directions)[0])
+
+    def one(i: Array, found: Any) -> Any:
+        new = function(jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, i, keepdims=False), directions))
+        return jax.tree.map(lambda a, b: jax.lax.dynamic_update_index_in_dim(a, b, i, 0), found, new)
+
+    nothing = jax.tree.map(lambda a: jnp.zeros((total, *a.shape), a.dtype), shapes)
+    return jax.lax.fori_loop(0, count, one, nothing)
+
+
+def _count(rows: Array, p: Array) -> Array:
+    """Return how many directions there are up to the last one that moves something."""
+    moves = (rows < len(p)).reshape(len(rows), -1).any(axis=1)
+    return jnp.max(jnp.where(moves, jnp.arange(1, len(rows) + 1), 0))
+
+
+def _picked(table: Array, row: Array) -> Array:
+    """Return the entry of a table, (J, n, ...), that stands in a row, or in (L,), each for a part of the last axis."""
+    if row.ndim == 0:
+        return table[row]
+    cut = table.reshape(*table.shape[:-1], len(row), table.shape[-1] // len(row))
+    found = jax.vmap(lambda part, row: part[row], in_axes=(-2, 0), out_axes=-2)(cut, row)
     return found.reshape(*found.shape[:-2], table.shape[-1])
 
 
