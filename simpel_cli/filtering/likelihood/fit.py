@@ -93,7 +93,7 @@ class Optimum(NamedTuple):
 
 
 Watch = Callable[[int, int], None]
-Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which of them are worth going on with
+Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which are worth going on with
 
 
 class Course(NamedTuple):
@@ -235,15 +235,9 @@ class Fitter:
 
 
 def _optimum(
-    z: np.ndarray,
-    free: tuple[int, ...],
-    uniform: np.ndarray,
-    loss: float,
-    gradient: np.ndarray,
-    fisher: np.ndarray,
-    iterations: int,
-    converged: bool,
-) -> Optimum:
+    z: np.ndarray, free: tuple[int, ...], uniform: np.ndarray, loss: float, gradient: np.ndarray, fisher: np.ndarray,
+    iterations: int, converged: bool,
+) -> Optimum:  # fmt: skip
     d = len(free)
     if not np.isfinite(loss) or not np.isfinite(fisher).all():
         return Optimum(z, free, np.inf, -np.inf, 0 * gradient, np.eye(d), z[list(free)], np.eye(d), iterations, False)

@@ -129,7 +129,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             at_first = None if moved is None else moved[:, 0, 0]
             push = push_of(row, ask, moved)
             reading = reading_of(row, ask, at_first)
-            if then_of is not None:
+            if then_of is not None and early is not None:
                 reading = chosen(early, then_of(row, ask, moved_before), reading)
             within = None
             if late is not None:
