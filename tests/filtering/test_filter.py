@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.errors_ahead import _free
-from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.likelihood.fit import POINTS, Fitter, Hypothesis
 from simpel_cli.filtering.likelihood.sensor_delay import JUMPS
 from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import Setup, questions, setup
@@ -226,6 +226,28 @@ def test_a_batch_has_the_losses_and_slopes_of_its_windows_one_by_one(plan: Setup
     np.testing.assert_allclose(
         together.gradient, sum(o.gradient - prior.gradient for o in single) + prior.gradient, rtol=1e-8, atol=1e-9
     )
+
+
+def test_fits_side_by_side_move_each_its_own_unknowns(plan: Setup) -> None:
+    n_p, weight = plan.coordinates.sizes[0], np.ones(len(plan.windows.episode))
+    noise = range(n_p, len(plan.start) - 1)
+    starts = [Hypothesis(plan.start, (*moves, *noise), weight) for moves in ((), (0, 1), (2,))]
+    alone, beside = (
+        Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=n, width=len(noise) + 3) for n in (1, 3)
+    )
+    assert (alone.side_by_side, beside.side_by_side) == (1, 3)
+    for one, other in zip(alone(starts, 1), beside(starts, 1), strict=True):
+        np.testing.assert_allclose(other.loss, one.loss, rtol=1e-9)
+        np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(other.fisher, one.fisher, rtol=1e-8, atol=1e-9)
+
+
+def test_fits_of_many_windows_run_one_by_one(plan: Setup) -> None:
+    def of(count: int) -> Fitter:
+        windows = plan.windows._replace(**{f: np.repeat(a[:1], count, 0) for f, a in plan.windows._asdict().items()})
+        return Fitter(plan.rule, plan.coordinates, windows, side_by_side=4)
+
+    assert [of(count).side_by_side for count in (2, POINTS // 4, POINTS // 3, POINTS, 5 * POINTS)] == [4, 4, 3, 1, 1]
 
 
 def test_noise_alone_is_fitted_the_same_in_a_narrow_program(plan: Setup) -> None:
