@@ -107,11 +107,13 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
         early = early_of(held.u[0, 0], nu)
         begin = predicted, u_s[:, 0, 0]
-        push_of, reading_of = _pushed(rates, p, x_s, u_s, asked), _pushed(sensors, p, *begin, asked)
         moves = late is not None or early is not None
+        # what the rates are at the beginning of the row is asked among their stages: their program is a large one
+        at_stages, at_begin = (x_s, u_s), begin if moves else (None, None)
+        push_of = _pushed(rates, p, *(_side_by_side(a, b) for a, b in zip(at_stages, at_begin, strict=True)), asked)
+        reading_of = _pushed(sensors, p, *begin, asked)
         first = now = end = None
         if moves:
-            now_of = _pushed(rates, p, *begin, asked)
             first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
         then_of = None if early is None else _pushed(sensors, p, predicted, before, asked)
         turned_of = None if bend is None else _pushed(bend, p, _ends(x_s), _ends(u_s), asked)
@@ -127,7 +129,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
             row, ask, moved, moved_before, slower = direction
             at_first = None if moved is None else moved[:, 0, 0]
-            push = push_of(row, ask, moved)
+            every = push_of(row, ask, None if moved is None else _side_by_side(moved, at_first if moves else None))
+            push = every[:, : 3 * substeps].reshape(nx, substeps, 3, *every.shape[2:])
             reading = reading_of(row, ask, at_first)
             if then_of is not None and early is not None:
                 reading = chosen(early, then_of(row, ask, moved_before), reading)
@@ -149,7 +152,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             end = _composed(by_x, push, h, sure)
             if not moves:
                 return Pushes(end, reading, None, None, None, turn, bent), within
-            return Pushes(end, reading, push[:, 0, 0], now_of(row, ask, at_first), push[:, -1, -1], turn, bent), within
+            return Pushes(end, reading, push[:, 0, 0], every[:, -1], push[:, -1, -1], turn, bent), within
 
         directions = (rows, asked, moved_s, moved_before, None if late is None else late[1])
         found, within = _of_each(one, directions, _count(rows, p))
@@ -272,6 +275,12 @@ def _picked(table: Array, row: Array) -> Array:
 def _stages_of(count: int) -> Array:
     """Return where the beginning, the middle and the end of a substep stand among its inputs."""
     return jnp.array([0, count // 2, count - 1])
+
+
+def _side_by_side(stages: Array, one: Array | None) -> Array:
+    """Return the stages of a row, (n, substeps, 3, ...), one after the other, and one more point behind them, (n, ...)."""
+    flat = stages.reshape(stages.shape[0], -1, *stages.shape[3:])
+    return flat if one is None else jnp.concatenate([flat, one[:, None]], axis=1)
 
 
 def _ends(a: Array) -> Array:
