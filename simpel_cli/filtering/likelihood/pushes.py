@@ -109,8 +109,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         begin = predicted, u_s[:, 0, 0]
         moves = late is not None or early is not None
         # what the rates are at the beginning of the row is asked among their stages: their program is a large one
-        at_stages, at_begin = (x_s, u_s), begin if moves else (None, None)
-        push_of = _pushed(rates, p, *(_side_by_side(a, b) for a, b in zip(at_stages, at_begin, strict=True)), asked)
+        every_x, every_u = (_side_by_side(a, b if moves else None) for a, b in zip((x_s, u_s), begin, strict=True))
+        push_of = _pushed(rates, p, every_x, every_u, asked)
         reading_of = _pushed(sensors, p, *begin, asked)
         first = now = end = None
         if moves:
