@@ -190,9 +190,16 @@ def echo(
     ages: Float[Array, " K"],
 ) -> Float[Array, "ny ..."]:
     """Return what every sensor still shows of the time before its derivatives jumped, so many seconds ago each."""
+    return jnp.sum(shares(d, tau, ages) * jumps, axis=(0, 1))
+
+
+def shares(
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], ages: Float[Array, " K"]
+) -> Float[Array, "K orders ny ..."]:
+    """Return what every sensor still shows of jumps of one, so many seconds ago each: the same for all rows."""
     age, faded = _faded(d, tau, ages)
     behind = signed_moments(jnp.maximum(-age, 0.0), jnp.broadcast_to(tau[None], age.shape))
-    return -jnp.sum(jnp.swapaxes(behind, 0, 1) * faded[:, None] * jumps, axis=(0, 1))
+    return -jnp.swapaxes(behind, 0, 1) * faded[:, None]
 
 
 def _in_time(function: Callable[..., Array], rate: Callable[..., Array], rise: Array) -> Callable[..., Array]:

@@ -42,6 +42,7 @@ from simpel_cli.filtering.likelihood.sensor_delay import (
     no_jumps,
     pushed,
     pushed_within,
+    shares_of,
     still_shown,
 )
 from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied, product, sure_of
@@ -162,6 +163,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
         return per_signal(p, sensor_delays, ny, own_delays), per_signal(p, sensor_lags, ny, own_lags)
 
+    def late_of(p: Array) -> tuple[Array, Array, Array] | None:
+        """Return these, and what is still shown of jumps of one; None: no sensor is late."""
+        return (*(late := late_by(p)), shares_of(*late, JUMPS * parts, dt, parts)) if late_ones else None
+
     def moving_in(p: Array, x: Array, u: Array, rate: Array, rate_x: Array) -> Motion:
         """Return the motion at a point of a row; u: of its substep. What is held jumps, others rise or fall in it."""
         if not (linear and late_ones):
@@ -182,6 +187,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         rate_x: Array,
         jumps: Array,
         begin: tuple[Array, ...],
+        late: tuple[Array, Array, Array] | None,
     ) -> tuple[Array, Array, Array]:
         """Return what the sensors read, its derivative in the state, and the latter if no sensor were late.
 
@@ -192,9 +198,9 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         if (early := early_of(inputs[1], nu)) is not None:
             read = read + jnp.sum(prompt * way_back(early, x, motion.rate, begin), axis=1)
             slope = slope_back(early, prompt, rate_x)
-        if late_ones:
-            d, tau = late_by(p)
-            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt, parts)
+        if late is not None:
+            d, tau, shares = late
+            read = read + jnp.sum(prompt * back(d, tau, motion), axis=1) + still_shown(shares, jumps)
             slope = slope - (d + tau)[:, None] * product(prompt, rate_x)
         return read, slope, prompt
 
@@ -219,12 +225,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
 
     def track(p: Array, noise: Noise, y: Array, ok: Array, u: Array, start: Array, spread: Array) -> tuple[Track, Held]:
         u_sub, half, sure = inputs(p, u), of_half_a_row(noise.q, dt), sure_of(noise.r)
+        late = late_of(p)
 
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
             x, cov, u_before, motion, rate_x, jumps, begin = carry
             y_k, (ok_k, larger), u_k = data
             predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0], nu)
-            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), motion, rate_x, jumps, begin)
+            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), motion, rate_x, jumps, begin, late)
             before = (motion, jumps) if late_ones else (None, None)
             if late_ones:
                 jumps = pushed(jumps, prompt, motion, moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p)))
@@ -290,11 +297,11 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         if pace is not None and early is not None:
             begin = x_before, rates(x_before, u_before[0, 0], p)[0], dt * pace
             now = now + jnp.sum(slope * way_back(early, x, rates(x, end, p)[0], begin), axis=1)
-        if late_ones:
-            (d, tau), motion = late_by(p), moving_in(p, x, u_before[-1], *rates(x, end, p))
+        if (late := late_of(p)) is not None:
+            (d, tau, shares), motion = late, moving_in(p, x, u_before[-1], *rates(x, end, p))
             begun = moving_in(p, x_before, u_before[0], *rates(x_before, u_before[0, 0], p))
             motion = motion.since(begun, dt if pace is None else dt * pace[None])
-            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(d, tau, jumps, dt, parts)
+            now = now + jnp.sum(slope * back(d, tau, motion), axis=1) + still_shown(shares, jumps)
             going = moving_in(p, x, u[0], *rates(x, u[0, 0], p))
             jumps = pushed(jumps, slope, motion, going)
             if parts > 1:

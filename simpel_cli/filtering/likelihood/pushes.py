@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from simpel_cli.dynamics.late_readings import echo
+from simpel_cli.dynamics.late_readings import shares
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
 from simpel_cli.filtering.likelihood.derivatives import RATES, SENSORS, Differentiated, Slopes, differentiated
-from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, back, of_rates, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, back, of_rates, shares_of, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, sure_of, where_asked
 from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
@@ -121,10 +121,12 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             some_late = jnp.any(late[0][0] > 0) | jnp.any(late[0][1] > 0)
             some_jump = jnp.any(held.u[1:, 0, :nu] != held.u[:-1, -1, :nu])
 
+            rings = _rings(*late[0])
+
         def shown(late: tuple[Array, Array]) -> Array:
             assert held.jumps is not None
             smooth = jnp.sum(held.prompt * back(*late, held.motion), axis=1)
-            return smooth + still_shown(*late, held.jumps, dt, timing.parts)
+            return smooth + still_shown(shares_of(*late, len(held.jumps), dt, timing.parts), held.jumps)
 
         def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
             row, ask, moved, moved_before, slower = direction
@@ -141,7 +143,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
                 if timing.parts > 1:
                     jumps = some_jump if ask is None else some_jump | ask
                     change = jnp.moveaxis(push[:, 1:, 0] - push[:, :-1, 2], 1, 0)
-                    show = lambda change: _still_to_be_shown(late[0], held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
+                    show = lambda change: _still_to_be_shown(rings, held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
                     within = where_asked(some_late & jumps, show, change)
             turn = bent = None
             if turned_of is not None:
@@ -162,11 +164,15 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
         return Ways(first, now, end, turn), found, within
 
-    def _still_to_be_shown(late: tuple[Array, Array], prompt: Array, change: Array, rate_x: Array) -> Array:
+    def _rings(d: Array, tau: Array) -> Array:
+        """Return what the next rows still show of jumps between the substeps of this one, (JUMPS, substeps - 1, ...)."""
+        ago = dt / substeps * jnp.arange(substeps - 1, 0, -1, dtype=d.dtype)  # at the end of the row
+        return jnp.stack([shares(d, tau, ago + k * dt) for k in range(JUMPS)])
+
+    def _still_to_be_shown(rings: Array, prompt: Array, change: Array, rate_x: Array) -> Array:
         """Return what is shown in the next rows, (JUMPS, ny, ...), where the rates jump between the substeps of this one."""
         jumps = of_rates(prompt, change, rate_x)
-        ago = dt / substeps * jnp.arange(substeps - 1, 0, -1, dtype=rate_x.dtype)  # at the end of the row
-        return jnp.stack([echo(*late, jumps, ago + k * dt) for k in range(JUMPS)])
+        return jnp.stack([still_shown(ring, jumps) for ring in rings])
 
     return pushes
 

@@ -6,10 +6,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.late_readings import JUMPS, ORDERS, ages, echo, signed_moments
+from simpel_cli.dynamics.late_readings import JUMPS, ORDERS, ages, shares, signed_moments
 from simpel_cli.filtering.likelihood.small_matrices import applied
 
-__all__ = ["JUMPS", "Motion", "back", "moving", "no_jumps", "of_rates", "pushed", "pushed_within", "still_shown"]
+__all__ = [
+    "JUMPS",
+    "Motion",
+    "back",
+    "moving",
+    "no_jumps",
+    "of_rates",
+    "pushed",
+    "pushed_within",
+    "shares_of",
+    "still_shown",
+]
 
 
 class Motion(NamedTuple):
@@ -80,26 +91,29 @@ def no_jumps(ny: int, x: Float[Array, "nx ..."], count: int = JUMPS) -> Float[Ar
 
 
 def still_shown(
-    d: Float[Array, "ny ..."],
-    tau: Float[Array, "ny ..."],
-    jumps: Float[Array, "K orders ny ..."],
-    dt: float,
-    parts: int = 1,
+    shares: Float[Array, "K orders ny ..."], jumps: Float[Array, "K orders ny ..."]
 ) -> Float[Array, "ny ..."]:
-    """Return what every sensor still shows of the time before its motion jumped.
+    """Return what every sensor still shows of the time before its motion jumped; shares: of `shares_of`."""
+    return jnp.sum(shares * jumps, axis=(0, 1))
+
+
+def shares_of(
+    d: Float[Array, "ny ..."], tau: Float[Array, "ny ..."], count: int, dt: float, parts: int = 1
+) -> Float[Array, "K orders ny ..."]:
+    """Return what every sensor still shows of jumps of one.
 
     Args:
         d: delay, s.
         tau: lag, s.
-        jumps: between so many parts of every row, the latest first.
+        count: of the jumps, the latest first.
         dt: distance of the rows, s.
-        parts: of a row; what jumped within the last one is in the difference that `Motion.since` takes for a rest, and is
-            taken out of it.
+        parts: of every row, between which a motion jumps; what jumped within the last one is in the difference that
+            `Motion.since` takes for a rest, and is taken out of it.
     """
-    ago = ages(len(jumps), dt / parts, d.dtype)
-    shown = echo(d, tau, jumps, ago)
+    ago = ages(count, dt / parts, d.dtype)
+    found = shares(d, tau, ago)
     if parts == 1:
-        return shown
-    share = (0.5 - ago[: parts - 1] / dt).reshape(-1, *(1,) * d.ndim)
-    no_rest = jnp.sum(jumps[: parts - 1, 2] * share - jumps[: parts - 1, 1] / dt, axis=0)
-    return shown + signed_moments(d, tau)[2] * no_rest
+        return found
+    within, moment = slice(parts - 1), signed_moments(d, tau)[2][None]
+    left = (0.5 - ago[within] / dt).reshape(-1, *(1,) * d.ndim)
+    return found.at[within, 1].add(-moment / dt).at[within, 2].add(moment * left)

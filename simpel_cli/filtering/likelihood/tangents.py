@@ -31,7 +31,7 @@ from simpel_cli.filtering.likelihood.clock import early_of
 from simpel_cli.filtering.likelihood.covariances import counted, of_half_a_row, of_row
 from simpel_cli.filtering.likelihood.early_values import slope_back, way_back
 from simpel_cli.filtering.likelihood.pushes import SMALL, Timing
-from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, Motion, back, moving, pushed, still_shown
+from simpel_cli.filtering.likelihood.sensor_delay import JUMPS, Motion, back, moving, pushed, shares_of, still_shown
 from simpel_cli.filtering.likelihood.small_matrices import apart, applied, product, sure_of
 from simpel_cli.filtering.likelihood.track import Held, Noise, Pushes, Track, Ways
 
@@ -74,7 +74,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
     def slopes(
         p: Array, noise: Noise, louder: Noise, at: Track, held: Held, ok: Array, ways: Ways, pushes: Pushes
     ) -> tuple[Array, Array]:
-        late = None if late_by is None else late_by(p)
+        late = None if late_by is None else (*(by := late_by(p)), shares_of(*by, JUMPS, dt))
         rows = _Rows(at, held, counted(ok), ways, None if held.pace is None else _shifted(dt * held.pace, dt))
         half, sure = of_half_a_row(noise.q, dt), sure_of(noise.r)
 
@@ -119,7 +119,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
         moved: _Moved,
         row: _Rows,
         push: Pushes | None,
-        late: tuple[Array, Array] | None,
+        late: tuple[Array, Array, Array] | None,
         half: Array,
         of_r: Array | None,
         of_half: Array | None,
@@ -135,7 +135,8 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
             read = read + jnp.sum(held.prompt * way_back(early, state, motion.rate, (*begin, _there(step))), axis=1)
         if late is not None:
             assert ways.now is not None
-            read = read + jnp.sum(held.prompt * back(*late, motion), axis=1) + still_shown(*late, jumps, dt)
+            d, tau, shares = late
+            read = read + jnp.sum(held.prompt * back(d, tau, motion), axis=1) + still_shown(shares, jumps)
             now = applied(ways.now, state)
             now = now if push is None or push.now is None else now + push.now
             jumps = pushed(jumps, held.prompt, motion, _moving(now, ways.now, push, held.pace))
