@@ -4,23 +4,29 @@ import os
 from importlib.metadata import PackageNotFoundError, version
 
 NO_YNN = "--xla_cpu_experimental_ynn_fusion_type="
+# Loops whose steps read less than 1 MB are one kernel each. Else every step calls dozens of them, each with a few numbers to work
+# out: the call is half of the time of a filter. A key that a version does not know does nothing.
+SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 
 
-def _without_wrong_fusions() -> None:
-    """Switch off the fusions with which jaxlib 0.10.2 to 0.12 silently computes wrong results on CPU (see jax-ml/jax#39103).
+def _with_switches() -> None:
+    """Set the switches of XLA that simpel needs; must run before JAX opens its backend.
 
-    Conjugate gradients with a matrix-valued operator came out wrong in 18 of 40 compilations, NaN or off by 1e100
-    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Must run before JAX opens its backend; flags of the user's
-    that name the same switch, or a file, are left alone. Later versions may not know the switch, and would not start with it.
+    With `NO_YNN` go the fusions with which jaxlib 0.10.2 to 0.12 silently computes wrong results on CPU (see jax-ml/jax#39103):
+    conjugate gradients with a matrix-valued operator came out wrong in 18 of 40 compilations, NaN or off by 1e100
+    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Later versions may not know it, and would not start with it.
+    Flags of the user's that name the same switch, or a file, are left alone.
     """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flags and not flags.startswith("-"):  # it names a file of flags
+        return
     try:
         found = tuple(int(part) for part in version("jaxlib").split(".")[:2])
     except (PackageNotFoundError, ValueError):
         return
-    flags = os.environ.get("XLA_FLAGS", "")
-    plain = not flags or flags.startswith("-")  # else it names a file of flags
-    if (0, 10) <= found <= (0, 12) and plain and "ynn_fusion" not in flags:
-        os.environ["XLA_FLAGS"] = f"{NO_YNN} {flags}".strip()
+    wanted = [SMALL_LOOPS, *([NO_YNN] if (0, 10) <= found <= (0, 12) else [])]
+    new = [one for one in wanted if one.split("=")[0] not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([*new, flags]).strip()
 
 
-_without_wrong_fusions()
+_with_switches()

@@ -21,7 +21,9 @@ from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
 
 SMALL = 3  # states of a model whose covariance follows the parameters
-POINTS = 8192  # at which derivatives are worked out at once: more do not fit a cache
+NUMBERS = (
+    32768  # of the rates' slopes along a track that are read at once, for every direction: more do not fit a cache
+)
 
 
 class Timing(NamedTuple):
@@ -78,7 +80,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             )
             return jax.tree.map(lambda a: jnp.moveaxis(a, -p.ndim, 0), found)
 
-        size = max(1, POINTS // (3 * substeps * at.predicted[0, 0].size))
+        size = max(1, NUMBERS // (nx**2 * 3 * substeps * at.predicted[0, 0].size))
         ways, found, within = _in_parts(of, (at.predicted, held, before, moved, moved_before), size)
         if within is not None:
             found = found._replace(reading=found.reading + _since(within))
@@ -233,8 +235,8 @@ def _along_rows(of: Differentiated, x: Array, u: Array, p: Array) -> Callable[[A
         return lambda row: _picked(table, of.place(row))
 
     def along(row: Array) -> Array:
-        if row.ndim == 0:
-            return of.along(row, x, u, p)
+        if row.size == 1:
+            return of.along(row.reshape(()), x, u, p[..., :1] if row.ndim else p)
         cut = [a.reshape(*a.shape[:-1], len(row), a.shape[-1] // len(row)) for a in (x, u, p)]
         cut[2] = cut[2][..., :1]  # numbers: what is made of them alone is made once
 
