@@ -4,8 +4,8 @@ import os
 from importlib.metadata import PackageNotFoundError, version
 
 NO_YNN = "--xla_cpu_experimental_ynn_fusion_type="
-# Loops whose steps read less than 1 MB are one kernel each. Else every step calls dozens of them, each with a few numbers to work
-# out: the call is half of the time of a filter. A key that a version does not know does nothing.
+# Loops whose steps read less than 1 MB are one kernel each. Else every step calls dozens of them, each with few numbers to work
+# out, and the calls are half of the time of a filter. A key that a version does not know does nothing.
 SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 
 

@@ -6,13 +6,15 @@ import pytest
 
 import simpel_cli
 
+THEIRS = "--xla_backend_extra_options=xla_cpu_fold_all_constants="
+
 
 @pytest.mark.parametrize(
     ("flags", "small_loops", "kept"),
     [
         ("", True, ""),
         ("--xla_dump_to=d", True, "--xla_dump_to=d"),
-        ("--xla_backend_extra_options=xla_cpu_fold_all_constants=", False, "--xla_backend_extra_options=xla_cpu_fold_all_constants="),
+        (THEIRS, False, THEIRS),
         ("flags.txt", False, "flags.txt"),
     ],
 )  # fmt: skip
