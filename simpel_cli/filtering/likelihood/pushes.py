@@ -123,7 +123,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             some_late = jnp.any(late[0][0] > 0) | jnp.any(late[0][1] > 0)
             some_jump = jnp.any(held.u[1:, 0, :nu] != held.u[:-1, -1, :nu])
 
-            rings = _rings(*late[0])
+            rings = _rings(*late[0]) if timing.parts > 1 else None
 
         def shown(late: tuple[Array, Array]) -> Array:
             assert held.jumps is not None
@@ -142,7 +142,7 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             if late is not None:
                 asks = jnp.any(slower[0] != 0) | jnp.any(slower[1] != 0)
                 reading = reading + where_asked(asks, lambda d: jax.jvp(shown, (late[0],), (d,))[1], slower)
-                if timing.parts > 1:
+                if rings is not None:
                     jumps = some_jump if ask is None else some_jump | ask
                     change = jnp.moveaxis(push[:, 1:, 0] - push[:, :-1, 2], 1, 0)
                     show = lambda change: _still_to_be_shown(rings, held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
