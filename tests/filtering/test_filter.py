@@ -127,6 +127,26 @@ def test_a_late_sensor_of_the_simulator_is_read_as_one_that_a_search_finds() -> 
     np.testing.assert_allclose(tracks[0], tracks[1], rtol=1e-9, atol=1e-12)
 
 
+def test_a_row_of_one_step_is_fitted_with_a_late_sensor_too() -> None:
+    """Nothing jumps within such a row; the slope in the delay is that of differences."""
+    late = [
+        Expression(
+            "sensor_delay", acts_on="v", operator="sensor_delay", parameters={"t": {"range": [0.0, 1.0], "unit": "s"}}
+        )
+    ]
+    plan = setup(model(), recording(), (), late, 1)
+    row = [q.name for q in plan.augmented.params].index("sensor_delay_v_t")
+    fitter, weight = Fitter(plan.rule, plan.coordinates, plan.windows, width=8), np.ones(len(plan.windows.episode))
+
+    def at(moved: float) -> Hypothesis:
+        z = plan.start.copy()
+        z[row] = 0.06 + moved
+        return Hypothesis(z, (row,), weight)
+
+    here, less, more = fitter([at(0.0), at(-1e-4), at(1e-4)], 1)
+    np.testing.assert_allclose(here.gradient, [(more.loss - less.loss) / 2e-4], rtol=0.05)
+
+
 @pytest.mark.parametrize(
     ("between", "arrives"),
     [("held", 0.0), ("linear", 0.0), ("held", 0.5), ("held", 0.375), ("held", 1.25), ("asked", 0.5)],
