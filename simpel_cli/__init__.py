@@ -14,8 +14,8 @@ def _with_switches() -> None:
 
     With `NO_YNN` go the fusions with which jaxlib 0.10.2 to 0.12 silently computes wrong results on CPU (see jax-ml/jax#39103):
     conjugate gradients with a matrix-valued operator came out wrong in 18 of 40 compilations, NaN or off by 1e100
-    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Later versions may not know a flag, and would not start with it.
-    Flags of the user's that name the same switch, or a file, are left alone.
+    (`tests/dynamics/test_jax.py`, seen with 0.10.2 and 0.12.0.1). Later versions may not know a flag, and would not start
+    with it. Flags of the user's that name the same switch, or a file, are left alone.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if flags and not flags.startswith("-"):  # it names a file of flags
