@@ -9,6 +9,7 @@ from test_sensor_checks import check, measured, motion
 
 from simpel_cli.data.estimation.derived_speeds import derived, difference_kind, differences, filter_kind
 from simpel_cli.data.estimation.kinematics import Motion, agreement, kinematics
+from simpel_cli.data.estimation.rounded_speeds import rounded_kind
 
 RNG = np.random.default_rng(0)
 
@@ -171,6 +172,10 @@ def low_pass(p: np.ndarray, dt: float) -> np.ndarray:
     return np.asarray(lfilter([0.5], [1, -0.5], np.gradient(p, dt)))
 
 
+def backward(p: np.ndarray, dt: float) -> np.ndarray:
+    return np.diff(p, prepend=p[0]) / dt
+
+
 def butterworth(p: np.ndarray, dt: float) -> np.ndarray:
     from scipy.signal import butter, lfilter
 
@@ -236,3 +241,54 @@ def test_a_declared_one_is_no_news() -> None:
     found = derived([Motion("a", "w", "rad/s", [(t, p, np.gradient(p, t))])], ["w"])
     assert found.ok
     assert found.detail == "w: declared as computed from other columns"
+
+
+def rounded(values: np.ndarray, step: float) -> np.ndarray:
+    return step * np.round(values / step)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.12])
+@pytest.mark.parametrize("steps", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize(
+    ("filtered", "kind"), [(low_pass, "central"), (np.gradient, "central"), (backward, "backward")]
+)
+def test_what_was_rounded_is_a_filtered_difference_all_the_same(
+    filtered: Callable, kind: str, steps: float, missing: float
+) -> None:
+    """Steps in standard deviations of the position's noise, and in those of what the filter makes of it."""
+    t, random = 0.02 * np.arange(600), np.random.default_rng(8)
+    p = motion(t)[0] + (noise := random.normal(0, 0.01, 600))
+    made, there = filtered(p, 0.02), random.random(600) >= missing
+    of_noise = float(np.std(filtered(noise, 0.02)))
+    found = Motion(
+        "a", "w", "rad/s", [(t[there], rounded(p, steps * 0.01)[there], rounded(made, steps * of_noise)[there])]
+    )
+    assert rounded_kind(found) == f"{kind} (filtered and rounded)"
+    assert "set data.columns {w: null}" in derived([found]).detail
+
+
+@pytest.mark.parametrize("own", [0.003, 0.05, 0.3])
+@pytest.mark.parametrize("steps", [0.5, 3.0, 10.0])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_rounded_velocity_of_its_own_is_no_difference(steps: float, own: float, late: bool) -> None:
+    t = 0.02 * np.arange(600)
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        p, v = motion(t)
+        v = low_pass(np.cumsum(v) * 0.02, 0.02) if late else v  # filtered, and of another sensor
+        read = (
+            rounded(p + random.normal(0, 0.01, 600), steps * 0.01),
+            rounded(v + random.normal(0, own, 600), steps * own),
+        )
+        assert rounded_kind(Motion("a", "w", "rad/s", [(t, *read)])) is None
+
+
+def test_rounding_that_hides_the_noise_tells_nothing_nor_do_few_rows_or_numbers_as_they_are() -> None:
+    t, random = 0.02 * np.arange(600), np.random.default_rng(8)
+    p = motion(t)[0] + random.normal(0, 0.01, 600)
+    v = low_pass(p, 0.02)
+    assert rounded_kind(Motion("a", "w", "rad/s", [(t, rounded(p, 0.2), rounded(v, 3.0))])) is None
+    assert rounded_kind(Motion("a", "w", "rad/s", [(t, p, v)])) is None
+    few = slice(0, 80)
+    assert rounded_kind(Motion("a", "w", "rad/s", [(t[few], rounded(p, 0.02)[few], rounded(v, 0.2)[few])])) is None
+    assert rounded_kind(Motion("a", "w", "rad/s", [])) is None

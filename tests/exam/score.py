@@ -5,7 +5,7 @@ of which it is said that these data cannot tell it from the two that are planted
 the planted one; part: one of two; wrong: a name that is not there; nothing, unexplained.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,9 +43,9 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
         left = found["verdict"] == "unexplained" or found["remainder"]
         return FALSE if claimed else UNEXPLAINED if left else RIGHT
     if kind == "outside":
-        if claimed:
-            return RIGHT if found["remainder"] else WRONG
-        return RIGHT if found["verdict"] == "unexplained" else NOTHING
+        if found["remainder"]:
+            return RIGHT
+        return WRONG if claimed else RIGHT if found["verdict"] == "unexplained" else NOTHING
     if not claimed:
         return UNEXPLAINED if found["verdict"] == "unexplained" else NOTHING
     planted = list(truth["effects"])
@@ -53,7 +53,7 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
     for effect in claimed:
         judged = [(_grade(effect, planted[i], gains or {}), i) for i in range(len(planted))]
         judged = [(g, i) for g, i in judged if g in ORDER and (i in open_ or kind == "shape")]
-        if len(open_) == len(planted) == 2 and not judged and _said_to_be(effect, planted):
+        if len(open_) == len(planted) and not judged and _said_to_be(effect, planted, allowed):
             grades.append(TIE)
             open_ = []
             continue
@@ -65,11 +65,14 @@ def outcome(truth: Mapping[str, Any], found: Mapping[str, Any], gains: Gains | N
     return PART if open_ else max(grades, key=ORDER.index)
 
 
-def _said_to_be(effect: Mapping[str, Any], planted: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether it is said of an effect that these data cannot tell it from the two that are planted."""
+def _said_to_be(
+    effect: Mapping[str, Any], planted: Sequence[Mapping[str, Any]], allowed: Collection[tuple[str, str]]
+) -> bool:
+    """Whether it is said of an effect that these data cannot tell it from the two that are there, one maybe a nuisance."""
     same = [
         {(n, p["acts_on"]) for n in p["accept"]} | {tuple(t.split("@")) for t in p["twins"]} for p in planted
     ]  # fmt: skip
+    same += [{*allowed}] if len(same) == 1 else []
     return any(
         (first["name"], first["acts_on"]) in same[i] and (second["name"], second["acts_on"]) in same[1 - i]
         for first, second in effect.get("same_as_two", ())

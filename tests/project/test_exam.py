@@ -302,6 +302,7 @@ OFFSET = claim("input_offset", on="u")
 EITHER = claim("constant_load", "input_offset") | {"class_acts_on": {"constant_load": "v", "input_offset": "u"}}
 ASYMMETRIC = claim("asymmetric_friction")
 PAIR = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "input_offset", "acts_on": "u"}]
+BESIDE_A_NUISANCE = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "sensor_delay", "acts_on": "v"}]
 LEFT = {"acts_on": "v", "depends_on": ["v"]}
 LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts_on": "v"}]}
 LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
@@ -338,6 +339,8 @@ LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
         ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}, claim("leak")), "wrong"),
         ("two", [COULOMB, DELAY], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
         ("one", [COULOMB], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
+        ("one", [COULOMB], verdict(ASYMMETRIC | {"same_as_two": [BESIDE_A_NUISANCE]}), "tie"),
+        ("one", [LOAD], verdict(ASYMMETRIC | {"same_as_two": [BESIDE_A_NUISANCE]}), "wrong"),
         ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("leak")), "wrong"),
         ("two", [COULOMB, DELAY], verdict(claim("coulomb_friction"), claim("input_delay", "input_lag", on="u")), "tie"),
         ("shape", [DRAG], verdict(claim("quadratic_drag"), claim("viscous_friction")), "right"),
@@ -346,6 +349,8 @@ LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
         ("outside", [planted("wind")], verdict(kind="unexplained", remainder=LEFT), "right"),
         ("outside", [planted("wind")], verdict(claim("cogging"), remainder=LEFT), "right"),
         ("outside", [planted("wind")], verdict(claim("cogging")), "wrong"),
+        ("outside", [planted("wind")], verdict(LATE, remainder=LEFT), "right"),
+        ("outside", [planted("wind")], verdict(LATE), "nothing"),
         ("outside", [planted("wind")], verdict(kind="none"), "nothing"),
     ],
 )  # fmt: skip

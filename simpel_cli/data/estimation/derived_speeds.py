@@ -7,29 +7,26 @@ A difference quotient is found by itself. Whatever else makes a velocity of the 
 a weighted difference (no a), a digital filter behind a difference (a at rows before), or one that was run forwards and
 backwards (a on both sides). Any smooth motion without noise fulfils such an equation. So the position must carry noise: its
 high differences must be those of a white signal. That noise cannot be in a velocity of another sensor, and reading it through
-c shows what an independent velocity would miss the equation by at least.
+c shows what an independent velocity would miss the equation by at least. Where numbers were rounded, `rounded_speeds` asks.
 
 Reference: Savitzky and Golay (1964), Smoothing and differentiation of data by simplified least squares procedures; Oppenheim
 and Schafer (2010), Discrete-time signal processing, 6.3 (rational filters).
 """
 
 from collections.abc import Sequence
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
 
 from simpel_cli.data.estimation.kinematics import Motion
+from simpel_cli.data.estimation.position_noise import NORMAL, WHITE, on_grid, white_level
+from simpel_cli.data.estimation.rounded_speeds import rounded_kind
 from simpel_cli.data.recording import Check
 
 DERIVED = 0.25  # of the velocity's noise; an independent sensor differs from a difference by at least all of it
 ROWS_PER_WEIGHT = 5  # fewer, and least squares explain anything
-WHITE = 0.7  # white noise has the same level at orders 4 and 8; a smooth signal loses it, a coarsely sampled one gains
 FILTERED = 0.1  # of the position's noise in the velocity; one of its own sensor differs by all of it
 NOISE_FREE = 1e-6  # of the velocity: less noise is rounding, and tells nothing of where the numbers came from
-USUAL = 1.5  # times the median step: a longer one has a gap in it
-LONGEST_PAUSE = 11  # rows that a filter may read
-NORMAL = 0.6745  # median of the size of a normal variable of unit variance
 SMOOTHED = "smoothed"
 
 
@@ -64,7 +61,7 @@ def differences(motions: Sequence[Motion]) -> dict[str, str]:
     """
     found = {}
     for motion in motions:
-        kind = difference_kind(motion) or filter_kind(motion)
+        kind = difference_kind(motion) or filter_kind(motion) or rounded_kind(motion)
         if kind:
             found[motion.velocity] = f"the {kind} difference of {motion.position}"
     return found
@@ -108,12 +105,12 @@ def difference_kind(motion: Motion) -> str | None:
 
 def filter_kind(motion: Motion) -> str | None:
     """Say whether the velocity is a filtered difference of the position: `SMOOTHED`, or None. Rows may be missing."""
-    pieces = [_on_grid(*piece) for piece in motion.pieces if len(piece[0]) > 1]
+    pieces = [on_grid(*piece) for piece in motion.pieces if len(piece[0]) > 1]
     if not pieces:
         return None
     centre = np.nanmean(np.concatenate([p for p, _ in pieces]))
     pieces = [(p - centre, v) for p, v in pieces]
-    levels = [_white_level([p for p, _ in pieces], order) for order in (4, 8)]
+    levels = [white_level([p for p, _ in pieces], order) for order in (4, 8)]
     if not WHITE * levels[0] < levels[1] < levels[0] / WHITE:
         return None
     return SMOOTHED if any(_comes_from(form, pieces, levels[0]) for form in FILTERS) else None
@@ -145,22 +142,3 @@ def _rows(form: Filter, p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nd
     reads = [p[k + j] for j in range(-form.reach, form.reach + 1)]
     reads += [v[k + i] for i in range(-form.before, form.after + 1) if i]
     return np.stack(reads, axis=1), v[k]
-
-
-def _on_grid(t: np.ndarray, p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows in equal steps, NaN where some are missing; stamps may be rounded, and no filter looks over a long pause."""
-    steps = np.diff(t)
-    usual = steps[steps < USUAL * np.median(steps)]
-    step = float(np.mean(usual)) if usual.size else float(np.median(steps))
-    rows = np.clip(np.rint(steps / step), 1, LONGEST_PAUSE) if step > 0 else np.ones(len(steps))
-    k = np.concatenate([[0], np.cumsum(rows)]).astype(int)
-    both = np.full((2, k[-1] + 1), np.nan)
-    both[:, k] = p, v
-    return both[0], both[1]
-
-
-def _white_level(signals: Sequence[np.ndarray], order: int) -> float:
-    """Standard deviation of the white noise that differences of some order would come from, by their median."""
-    found = np.concatenate([np.diff(s, order) for s in signals])
-    found = found[np.isfinite(found)]
-    return float(np.median(np.abs(found))) / (NORMAL * np.sqrt(comb(2 * order, order))) if len(found) else 0.0

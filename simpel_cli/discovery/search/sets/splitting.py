@@ -10,14 +10,14 @@ from simpel_cli.discovery.search.trials import SAME, TIE, Search, Trial
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simulators.effects import Term
 
-MOST_OF_IT = (
-    0.4  # of what an effect explains beyond its special case, to first order: so much another one has to promise
-)
-FITTED = 4  # pairs
+# of what an effect explains beyond its special case: so much another one has to promise to first order, which is about the
+# best size of the special case alone, and may be far from that of both
+A_GOOD_PART = 0.2
+FITTED = 8  # pairs: what promises to saturate a signal promises too much, and is fitted in vain
 
 
 def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, Term]]:
-    """Return the pairs that fit as well as one chosen effect: a special case of it where it acts, and another effect.
+    """Return the pairs that fit at least as well as one chosen effect: a special case of it where it acts, and another effect.
 
     Neither alone does, and the other one is no more general form of the special case: that would be a rival by itself.
 
@@ -48,9 +48,10 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
             t for t in search.candidates(less)
             if t != own and not search.terms[t].depends_on and not _is_special(search.terms[special], search.terms[t])
         ]  # fmt: skip
-        for t in _promising(search, before, others, MOST_OF_IT * (before.optimum.loss - whole.loss)):
+        for t in _promising(search, before, others, A_GOOD_PART * (before.optimum.loss - whole.loss)):
             pair, alone = (*less, t), (*rest, t)
-            if not _as_good(_best(search, pair, search.hypotheses(pair, t, before.optimum.z)), whole):
+            both = _best(search, pair, search.hypotheses(pair, t, before.optimum.z))
+            if not (_as_good(both, whole) or _better(both, whole)):
                 continue
             by_itself = _best(search, alone, search.hypotheses(alone, t, off))
             known = any({special, t} == {*earlier} for earlier in found)

@@ -16,6 +16,7 @@ import casadi
 import numpy as np
 
 from simpel_cli.discovery.search.trials import TIE
+from simpel_cli.discovery.search.unexplained.drifts import drifting
 from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.filtering.likelihood.augmented import Augmented, augment
 from simpel_cli.filtering.likelihood.sensitivity import shifts
@@ -56,11 +57,18 @@ def worth_a_search(levels: NoiseProfile, alone: NoiseProfile, terms: Sequence[Te
     if not terms:
         return None
     chosen = levels.chosen.optimum.log_evidence - alone.chosen.optimum.log_evidence
-    instead = remembered(alone, terms) if levels.chosen.terms else None
+    instead = _more_than_a_drift(alone, terms) if levels.chosen.terms else None
     if instead is not None and instead.gain > chosen - TIE:
         return instead, False
-    beside = remembered(levels, terms)
+    beside = _more_than_a_drift(levels, terms)
     return None if beside is None else (beside, True)
+
+
+def _more_than_a_drift(levels: NoiseProfile, terms: Sequence[Term]) -> Memory | None:
+    """Return what is remembered unless a parameter that is no constant promises more: a slow state fits a slow change, too."""
+    found = remembered(levels, terms)
+    drift = None if found is None else drifting(levels)
+    return found if drift is None or found is None or found.gain > drift.gain else None
 
 
 def remembered(levels: NoiseProfile, terms: Sequence[Term]) -> Memory | None:
