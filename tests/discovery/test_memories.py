@@ -19,7 +19,9 @@ from simpel_cli.discovery.search import again as again_module
 from simpel_cli.discovery.search.again import Again, Earlier, asked_again, beside
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, worth_a_search
+from simpel_cli.discovery.search.unexplained.memories import Memory, _Course, remembered, worth_a_search
+from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.augmented import augment
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.measurements.windows import windows_of
@@ -41,15 +43,16 @@ DATA = "path: {path}\ntime: t\nepisode: episode\nsplit: {{column: split}}\n"
 WALL = {"k": 0.03, "tau": 60.0}
 
 
-def heaters(k: float, tau: float, seed: int = 3) -> pd.DataFrame:
-    """Rows of a heater that exchanges heat with a wall."""
+def heaters(k: float, tau: float, seed: int = 3, drift: float = 0.0) -> pd.DataFrame:
+    """Rows of a heater that exchanges heat with a wall, and of which a share of the power drifts over every episode."""
     random, parts = np.random.default_rng(seed), []
     for episode in range(6):
         u = np.repeat(random.uniform(0, 1, 5), 16)
         x = np.full(2, random.uniform(20, 30))
         rows = []
-        for held in u:
+        for i, each in enumerate(u):
             rows.append(x[0])
+            held = each * (1 + drift * (i / len(u) - 0.5))
 
             def rate(_: float, x: Any, held: float = held) -> list[float]:
                 return [0.02 * (AMBIENT - x[0]) + 0.8 * held + k * (x[1] - x[0]), (x[0] - x[1]) / tau]
@@ -189,17 +192,40 @@ def test_columns_of_what_was_measured_are_found_beside_a_state_that_has_none() -
     np.testing.assert_array_equal(found.ok[0], [[1, 0.5], [1, 0.5], [1, 0], [1, 0.5]])
 
 
-@pytest.mark.parametrize("k", [WALL["k"], 0.0], ids=["wall", "none"])
-def test_a_state_of_its_own_is_asked_beside_what_was_chosen_before_a_search_begins_again(k: float) -> None:
-    """What promises much to first order may earn nothing."""
-    rows = heaters(k, WALL["tau"])
+def recorded(rows: pd.DataFrame) -> Recording:
     episodes = [
         Episode(str(e), part["t"].to_numpy(), part[["T"]].to_numpy(), part[["u"]].to_numpy(), np.zeros((len(part), 0)))
         for e, part in rows.groupby("episode")
     ]
-    data = Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"T": 0.05}, (), (Check("c", True, ""),), ())
+    return Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"T": 0.05}, (), (Check("c", True, ""),), ())
+
+
+@pytest.mark.parametrize(("k", "drift"), [(WALL["k"], 0.0), (0.0, 0.3), (0.0, 0.4)])
+def test_a_state_is_asked_only_where_it_promises_more_than_a_drift(k: float, drift: float) -> None:
+    """A slow state fits a slow change, too."""
     model = heater()
-    attach = partial(setup, model, data, (), [], 1)
+    plan = setup(model, recorded(heaters(k, WALL["tau"], drift=drift)), (), [], 1, kept=frozenset())
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=6))
+    levels = NoiseProfile(search, Assessor(plan, 10), search.base())
+    state = {"z": {"rate": "(given - z)/tau", "unit": "U", "range": ["-U", "U"], "begins": "given"}}
+    parameters = {
+        "k": {"range": ["-3*A/U", "3*A/U"], "unit": "A/U", "starts": ["0.1*A/U"]},
+        "tau": {"range": [6, 6000], "neutral": 60, "prior": "loguniform", "starts": [12, 60, 300, 1200]},
+    }  # fmt: skip
+    after_effect = wall(term="k*z", states=state, parameters=parameters)
+    effects = [wall(), after_effect]
+    terms = [t for e in effects for t in e.attach(model, plan.scales, ("T",))]
+    promised = remembered(levels, terms)
+    assert promised is not None
+    found = worth_a_search(levels, levels, terms)
+    assert found == ((promised, True) if k else None)
+
+
+@pytest.mark.parametrize("k", [WALL["k"], 0.0], ids=["wall", "none"])
+def test_a_state_of_its_own_is_asked_beside_what_was_chosen_before_a_search_begins_again(k: float) -> None:
+    """What promises much to first order may earn nothing."""
+    model = heater()
+    attach = partial(setup, model, recorded(heaters(k, WALL["tau"])), (), [], 1)
     plan = attach(kept=frozenset())
     # what the search knows of its windows: values that count less, and where they begin
     ok, start = 0.9 * plan.windows.ok, plan.windows.start + 0.01
