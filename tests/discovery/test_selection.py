@@ -43,13 +43,13 @@ class MadeUp:
 
     width = 12
 
-    def __init__(self, row: int, neutral: float) -> None:
-        self.row, self.neutral, self.far = row, neutral, 0
+    def __init__(self, row: int, neutral: float, near: float = 0.02) -> None:
+        self.row, self.neutral, self.near, self.far = row, neutral, near, 0
 
     def __call__(self, hypotheses: Sequence[Hypothesis], most: int = 0, hopes: Any = None) -> list[Optimum]:
         found = []
         for hypothesis in hypotheses:
-            far = abs(hypothesis.z[self.row] - self.neutral) > 0.02
+            far = abs(hypothesis.z[self.row] - self.neutral) > self.near
             self.far += far and most == 0
             eye, d = np.eye(len(hypothesis.free)), len(hypothesis.free)
             loss = 500.0 if far else 80.0
@@ -61,10 +61,12 @@ class MadeUp:
         return found
 
 
-def test_a_fit_that_is_worse_than_the_model_it_contains_begins_again_beside_it() -> None:
+@pytest.mark.parametrize("near", [0.02, 0.001])
+def test_a_fit_that_is_worse_than_the_model_it_contains_begins_again_beside_it(near: float) -> None:
+    """An effect of a thousandth of its range is lost in a start of a hundredth."""
     search: Any = searched("b")
     t = next(i for i, term in enumerate(search.terms) if term.effect == "drag")
-    fitter = MadeUp(search.rows[t][0], search.plan.start[search.rows[t][0]])
+    fitter = MadeUp(search.rows[t][0], search.plan.start[search.rows[t][0]], near)
     search.fitter = fitter
     z, free = search.plan.start, search.free(())
     eye = np.eye(len(free))
@@ -82,11 +84,13 @@ def test_a_candidate_starts_with_noise_that_a_wrong_size_can_hide_in() -> None:
     z[n_p : n_p + n_r + n_q] = 0.0  # a filter that is sure of everything
     for hypothesis in (
         *search.hypotheses((0,), 0, z),
-        search.beside(Trial((), search.base().optimum._replace(z=z)), 0),
+        search.beside(Trial((), search.base().optimum._replace(z=z)), 0)[0],
     ):
         r, q = hypothesis.z[n_p : n_p + n_r], hypothesis.z[n_p + n_r : n_p + n_r + n_q]
         np.testing.assert_array_equal(r, search.plan.start[n_p : n_p + n_r])
         assert (q >= search.plan.start[n_p + n_r : n_p + n_r + n_q] - QUIETER).all()
+    quiet = search.beside(Trial((), search.base().optimum._replace(z=z)), 0)[1].z
+    np.testing.assert_array_equal(quiet[n_p : n_p + n_r + n_q], z[n_p : n_p + n_r + n_q])
     loud = z.copy()
     loud[n_p : n_p + n_r + n_q] = 0.95
     np.testing.assert_array_equal(search.loud(loud), loud)
@@ -328,7 +332,7 @@ def test_names_are_tied_by_evidence_or_by_fits_that_differ_in_the_width_of_prior
 ) -> None:
     search: Any = Table({"": 0.0, "A": 30.0}).search
     a, b = (next(i for i, t in enumerate(search.terms) if t.effect == name) for name in "AB")
-    chosen = Trial((a,), search.fitter([search.beside(search.base(), a)])[0])
+    chosen = Trial((a,), search.fitter(search.beside(search.base(), a))[0])
     there = chosen.optimum
     other = Trial((b,), there._replace(loss=there.loss + worse_fit, log_evidence=there.log_evidence - less_evidence))
     assert search.as_good(other, chosen, a) is tied

@@ -30,7 +30,7 @@ SHARE_OF_OWN = 0.4  # likewise
 NEARLY_THE_BEST = 0.7  # of the gain of a stage's best, which others have to reach where no search begins with them
 KEPT = 4  # starts of a stage that are fitted in any case
 ASTRAY = 1.0  # nats of log posterior by which a larger model's fit is worse than the smaller model's
-NEARLY = 0.01  # of a parameter's range
+NEARLY, MUCH_NEARER = 0.01, 1e-4  # of a parameter's range
 QUIETER = 0.1  # of the range of log q, than at the very start
 ANYWHERE = 3  # starts of an effect anywhere in the ranges of its parameters
 STARTS = 6  # of the model as it is
@@ -158,13 +158,19 @@ class Search:
             hypotheses.append(Hypothesis(start, self.free(terms), self.ones))
         return hypotheses
 
-    def beside(self, before: Trial, new: int) -> Hypothesis:
-        """Start of a model with one term more at the optimum without it, the term all but switched off."""
-        start = self.loud(before.optimum.z)
-        for row in self.rows[new]:
-            start[row] = np.clip(self.plan.start[row], NEARLY, 1 - NEARLY)
-        start[list(self.spreads_of[new])] = BEGIN
-        return Hypothesis(start, self.free((*before.terms, new)), self.ones)
+    def beside(self, before: Trial, new: int) -> list[Hypothesis]:
+        """Starts of a model with one term more at the optimum without it, the term all but switched off.
+
+        With loud noise, and with that of the optimum, where a step of the term has to be much smaller.
+        """
+        z, starts = before.optimum.z, []
+        for noise, step in ((self.loud(z), NEARLY), (z, MUCH_NEARER)):
+            start = noise.copy()
+            for row in self.rows[new]:
+                start[row] = np.clip(self.plan.start[row], step, 1 - step)
+            start[list(self.spreads_of[new])] = BEGIN
+            starts.append(Hypothesis(start, self.free((*before.terms, new)), self.ones))
+        return starts
 
     def loud(self, z: np.ndarray) -> np.ndarray:
         """Return a start with noise that a step in the wrong direction can hide in.
@@ -288,7 +294,8 @@ class Search:
         fits |= {t: [] for t, own in behind.items() if t in lost and min(own) > worst}
         # a model that contains another cannot be worse: such a fit went astray, and begins again beside the smaller model
         astray = [t for t, optima in fits.items() if min((o.loss for o in optima), default=np.inf) > worst]
-        for t, optimum in zip(astray, self.fitter([self.beside(before, t) for t in astray]), strict=True):
+        again = [(t, start) for t in astray for start in self.beside(before, t)]
+        for (t, _), optimum in zip(again, self.fitter([start for _, start in again]), strict=True):
             fits[t].append(optimum)
         trials = [self.best((*before.terms, t), optima) for t, optima in fits.items()]
         left = {
