@@ -9,7 +9,7 @@ from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.between_rows import _better, asked_beside, in_words, preferences, settled, words_of
 from simpel_cli.discovery.search.calibration import prepared
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.trials import ACCEPT, Search
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, questions, setup, terms_of
 from simpel_cli.runs.console import Terminal
@@ -149,3 +149,22 @@ def test_beside_an_effect_the_question_is_asked_anew(truth: str) -> None:
     print({n: p.gain for n, p in alone.items()}, {n: p.gain for n, p in beside.items()})
     assert beside["u"].gain > 50
     assert beside["u"].gain > abs(alone["u"].gain)
+
+
+def test_a_delay_that_makes_up_for_the_wrong_way_is_not_in_its_favour() -> None:
+    """An input that is held, taken for one that goes straight, is half a row late: held it is not, and needs no delay."""
+    data = recording(5)
+    late = Expression(
+        "late", acts_on="u", operator="delay", parameters={"d": {"range": [0, 0.3], "unit": "s", "starts": [0.03]}}
+    )
+    attach = partial(setup, recording=data, declared_noise=(), effects=[late], substeps=OPTIONS.substeps)
+    search = search_of(attach(rotor(u="linear", v="held")))
+    (place,) = (i for i, t in enumerate(search.terms) if t.effect == "late" and t.acts_on == "u")
+    chosen = search.add(search.base(), [place]).trials[0]
+    (row,) = search.rows[place]
+    assert search.plan.coordinates.value(row, float(chosen.optimum.z[row])) == pytest.approx(0.05, abs=0.01)
+    beside = asked_beside(attach, rotor(u="linear", v="held"), search, chosen, 2)
+    assert beside == {}  # it is said
+    beside = asked_beside(attach, rotor(v="held"), search, chosen, 2)
+    assert beside["u"].word == "held"
+    assert beside["u"].gain > ACCEPT

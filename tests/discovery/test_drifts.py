@@ -9,28 +9,33 @@ from test_ranges import cart, searched
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.search.unexplained.drifts import BETWEEN, OVER, Drift, drifting, stands_for
+from simpel_cli.discovery.search.unexplained.drifts import BETWEEN, OVER, Drift, drifting, may_stand_for, stands_for
+from simpel_cli.discovery.search.unexplained.instead_of_drifts import needed_beside, with_drift, with_progress
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import dependence, remainder_of
 from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.setup import Setup, setup
+from simulators.effects import Expression
+from simulators.model import Model
 
 FINE = 20  # steps per row
 
 
-def pushed(drift: float, differs: tuple[float, ...] = (0.0,) * 6) -> Recording:
-    """Carts whose gain is 1.2 + differs[e] + drift (t/T - 1/2), with 1 mm and 1 mm/s of noise."""
+def pushed(drift: float, differs: tuple[float, ...] = (0.0,) * 6, drag: float = 0.0, low: float = -3) -> Recording:
+    """Carts whose gain is 1.2 + differs[e] + drift (t/T - 1/2), with 1 mm and 1 mm/s of noise, and maybe a drag, 1/m."""
     random = np.random.default_rng(5)
     episodes = []
     for e in range(len(differs) + 1):
         own = (*differs, 0.0)[e]
-        u = np.repeat(random.uniform(-3, 3, 10), 6)
+        u = np.repeat(random.uniform(low, 3, 10), 6)
         x = np.zeros((60, 2))
         for i in range(59):
             s, v = x[i]
             for k in range(FINE):
                 b = 1.2 + own + drift * ((i + (k + 0.5) / FINE) / 59 - 0.5)
                 h = 0.1 / FINE
-                s, v = s + h * v + h**2 / 2 * b * u[i], v + h * b * u[i]
+                a = b * u[i] - drag * v * abs(v)
+                s, v = s + h * v + h**2 / 2 * a, v + h * a
             x[i + 1] = s, v
         noisy = x + 1e-3 * random.normal(size=x.shape)
         episodes.append(Episode(str(e), np.arange(60) * 0.1, noisy, u[:, None], np.zeros((60, 0))))
@@ -94,3 +99,48 @@ def test_a_drift_stands_for_effects_that_explain_no_more() -> None:
     assert not stands_for(found, base, more)
     assert not stands_for(found, base, base)  # there are no effects
     assert not stands_for(None, base, some)
+
+
+def test_a_simulator_whose_parameter_drifts_is_the_one_with_its_value_at_every_row() -> None:
+    model = cart(0.8, 1.8)
+    moving = with_drift(model, "b")
+    assert [q.name for q in moving.params] == ["b", "drift_of_b"]
+    assert moving.params[1][1:4] == ("m/s^2/V", -1.0, 1.0)
+    x, u = np.array([0.1, -0.2]), np.array([1.5])
+    for progress in (-0.5, 0.0, 0.3):
+        found = moving.function()(x, [*u, progress], [1.2, 0.4])[0]
+        np.testing.assert_allclose(found, model.function()(x, u, [1.2 + 0.4 * progress])[0])
+    recording = with_progress(pushed(0.0))
+    assert recording.train[0].inputs.shape == (60, 2)
+    np.testing.assert_allclose(recording.train[0].inputs[:, 1], np.linspace(-0.5, 0.5, 60))
+
+
+@pytest.mark.parametrize("drift", [0.3, 0.0])
+def test_an_effect_that_a_search_takes_for_a_drift_earns_no_place_beside_it(drift: float) -> None:
+    """A softer motor at speed is a part of what a motor does that grows weaker while the cart goes faster."""
+    c = {"range": [-1, 1], "unit": "1/m", "starts": [0.02, -0.02]}
+    drag = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": c})
+    recording, model = pushed(-drift, drag=0.0 if drift else 0.02, low=0.0), cart(0.8, 1.8)
+    search = searched(recording, [drag], model)
+    (chosen, *_) = (t for t in search.add(search.base(), [0]).trials if search.terms[t.terms[-1]].effect == "drag")
+    assert chosen.optimum.log_evidence > search.base().optimum.log_evidence + 5
+
+    def attach(model: Model, *, recording: Recording, kept: frozenset) -> Setup:
+        return setup(model, recording, (), [drag], 1, kept=kept)
+
+    found = Drift("b", OVER, -0.3, "m/s^2/V", "v", 50.0)
+    assert needed_beside(found, attach, model, recording, search, chosen, 1) == ([] if drift else [0])
+    assert needed_beside(found._replace(how=BETWEEN), attach, model, recording, search, chosen, 1) == [0]
+
+
+def test_a_drift_may_stand_for_effects_where_it_promises_half_of_what_they_earn() -> None:
+    _, base, found = found_in(pushed(0.15))
+    assert found is not None
+    some, more = (
+        base._replace(terms=(0,), optimum=base.optimum._replace(log_evidence=float(base.optimum.log_evidence + gain)))
+        for gain in (1.9 * found.gain, 2.1 * found.gain)
+    )
+    assert may_stand_for(found, base, some)
+    assert not may_stand_for(found, base, more)
+    assert not may_stand_for(found, base, base)
+    assert not may_stand_for(None, base, some)

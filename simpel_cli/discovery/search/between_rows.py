@@ -14,14 +14,16 @@ import numpy as np
 
 from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
+from simpel_cli.discovery.search.trials import asked as asked_for
 from simpel_cli.dynamics.between_rows import WAY
-from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup, key_of, questions
-from simulators.effects.term import BETWEEN_ROWS
+from simulators.effects.term import BETWEEN_ROWS, DELAY, LAG, SENSOR_DELAY, SENSOR_LAG
 from simulators.model import Model
 from simulators.quantity import HELD, LINEAR, SMOOTH
 
 MOVES = {LINEAR: "goes straight from a row to the next", SMOOTH: "is a smooth curve from row to row"}
+LATE = (DELAY, LAG, SENSOR_DELAY, SENSOR_LAG)
 AGAINST = {LINEAR: "held or smooth", SMOOTH: "held or linear"}
 
 
@@ -70,22 +72,33 @@ def asked_beside(
 def preferences(search: Search, at: Trial) -> dict[str, Preference]:
     """Compare held, linear and smooth inputs in one model, input by input, then all at once.
 
+    What makes a signal late may be there for the half of a row by which a wrong way is off: each way may do without it.
+
     Args:
         search: with terms that ask.
         at: the model, fitted with the ways in `search.plan.start`.
     """
+    late = [t for t in at.terms if search.terms[t].kind in LATE]
+    models = [at.terms, *(tuple(t for t in at.terms if t != one) for one in late)]
+    price = [sum(asked_for(k + 1) for k in range(len(terms))) for terms in models]
+
+    def worth(fits: Sequence[Optimum]) -> float:
+        return max(float(np.nan_to_num(o.log_evidence, nan=-np.inf)) - p for o, p in zip(fits, price, strict=True))
+
     names = asked_inputs(search)
     rows = {t: search.rows[t][0] for t in names}
     best = {t: min(WAY, key=lambda word: abs(WAY[word] - search.plan.start[rows[t]])) for t in names}
     asked = [(t,) for t in names] + ([tuple(names)] if len(names) > 1 else [])
-    evidence = {tuple(best.values()): float(np.nan_to_num(at.optimum.log_evidence, nan=-np.inf))}
+    usual = search.fitter([_said(search, at, {}, rows, terms) for terms in models[1:]]) if late else []
+    evidence = {tuple(best.values()): worth([at.optimum, *usual])}
     choices = [LINEAR, HELD] if search.plan.clocked else [*WAY]  # a curve goes by whole rows
     while True:
         others = [best | dict.fromkeys(own, word) for own in asked for word in choices]
         said = [words for words in others if tuple(words.values()) not in evidence]
-        fits = search.fitter([_said(search, at, words, rows) for words in said]) if said else []
-        for words, fit in zip(said, fits, strict=True):
-            evidence[tuple(words.values())] = float(np.nan_to_num(fit.log_evidence, nan=-np.inf))
+        begun = [_said(search, at, words, rows, terms) for words in said for terms in models]
+        fits = search.fitter(begun) if begun else []
+        for i, words in enumerate(said):
+            evidence[tuple(words.values())] = worth(fits[i * len(models) : (i + 1) * len(models)])
         after = _better(best, others, evidence)
         if after == best:
             break
@@ -116,11 +129,13 @@ def _ahead(compared: Mapping[str, float], word: str) -> float:
     return compared[word] - max(gain for other, gain in compared.items() if other != word)
 
 
-def _said(search: Search, at: Trial, words: Mapping[int, str], rows: Mapping[int, int]) -> Hypothesis:
-    z = search.loud(at.optimum.z)
+def _said(
+    search: Search, at: Trial, words: Mapping[int, str], rows: Mapping[int, int], terms: tuple[int, ...]
+) -> Hypothesis:
+    z = search.off(search.loud(at.optimum.z), [t for t in at.terms if t not in terms])
     for t, word in words.items():
         z[rows[t]] = WAY[word]
-    return Hypothesis(z, search.free(at.terms), search.ones)
+    return Hypothesis(z, search.free(terms), search.ones)
 
 
 def settled(search: Search, words: Mapping[str, str]) -> np.ndarray:

@@ -25,6 +25,7 @@ from simulators.groups import MEMBER, SPREAD
 OVER, BETWEEN = "over an episode", "from episode to episode"
 SIZES = (0.5, 0.15, 0.05, 0.015)  # of the parameter's range
 CERTAIN = 10.0  # nats that it has to earn: no episode was held out for it
+HALF = 0.5
 LEAST_EPISODES = 3  # of which one can say that they differ
 
 
@@ -60,6 +61,12 @@ def stands_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:
     return drift is not None and bool(chosen.terms) and drift.gain > effects - TIE
 
 
+def may_stand_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:
+    """Whether it may do so once it is fitted: to first order a drift promises half of what it then explains, or more."""
+    effects = chosen.optimum.log_evidence - base.optimum.log_evidence
+    return drift is not None and bool(chosen.terms) and drift.gain > HALF * effects
+
+
 def drifting(levels: NoiseProfile) -> Drift | None:
     """Return the parameter that is no constant for which the data ask most; None where there is none."""
     plan, chosen = levels.search.plan, levels.chosen
@@ -73,24 +80,28 @@ def drifting(levels: NoiseProfile) -> Drift | None:
     progress, own = _progress(plan.windows), _indicators(plan.windows.episode)
     ways = [OVER] + ([BETWEEN] if own.shape[1] >= LEAST_EPISODES else [])
     penalty = np.log(len(SIZES) * len(names) * len(ways))
-    found = []
-    for row in plan.coordinates.driven:
-        here = levels(row)
+    driven = plan.coordinates.driven
+    found: list[Drift] = []
+    # a parameter of several rates made the noise of all of them necessary
+    for rows in [*((row,) for row in driven), *([driven] if len(driven) > 1 else [])]:
+        here = levels(*rows)
         if not here:
             continue
         base = max(level.reached for level in here) + penalty
+        alone = {(d.parameter, d.how): d for d in sorted(found, key=lambda one: one.gain)}
         for level in here:
             moves = _moves(level, plan.augmented, slopes, p, progress, model.dt)  # (names, W, T, ny, 2)
             for k, i in enumerate(names):
                 q = model.params[i]
                 span = float(plan.coordinates.high[i] - plan.coordinates.low[i])
                 span = q.high - q.low if plan.coordinates.log[i] else span
-                over, alike = moves[k, ..., 1], moves[k, ..., 0]
+                over, same = moves[k, ..., 1], moves[k, ..., 0]
                 for how in ways:
-                    columns = over[..., None] if how == OVER else alike[..., None] * own[:, None, None]
+                    columns = over[..., None] if how == OVER else same[..., None] * own[:, None, None]
                     gain, weights = _earned(level, columns * span)
                     size = float(weights[0] * span if how == OVER else np.std(weights) * span)
-                    acts_on = model.states[row].name
+                    by_itself = alone.get((q.name, how))
+                    acts_on = model.states[rows[0]].name if len(rows) == 1 or by_itself is None else by_itself.acts_on
                     found.append(Drift(q.name, how, size, q.unit, acts_on, float(level.reached + gain - base)))
     best = max(found, key=lambda one: one.gain, default=None)
     return best if best is not None and best.gain > CERTAIN else None

@@ -49,7 +49,7 @@ class Level(NamedTuple):
 
 
 class NoiseProfile:
-    """A chosen model at every level of the noise of one state; what was computed is kept."""
+    """A chosen model at every level of the noise of some states; what was computed is kept."""
 
     def __init__(self, search: Search, assessor: Assessor, chosen: Trial) -> None:
         self.search, self.assessor, self.chosen = search, assessor, chosen
@@ -57,23 +57,24 @@ class NoiseProfile:
         self.inputs = Forces(plan.rule, plan.coordinates, plan.augmented.model.dt).inputs(
             chosen.optimum.z, plan.windows
         )
-        self._found: dict[int, list[Level]] = {}
+        self._found: dict[tuple[int, ...], list[Level]] = {}
 
-    def __call__(self, row: int) -> list[Level]:
+    def __call__(self, *rows: int) -> list[Level]:
         """Return the levels at which the filter does not diverge.
 
         Args:
-            row: of the driven state whose process noise is taken down.
+            rows: of the driven states whose process noise is taken down, together.
         """
-        if row not in self._found:
+        if rows not in self._found:
             coordinates, z = self.search.plan.coordinates, self.chosen.optimum.z
-            i = sum(coordinates.sizes[:2]) + coordinates.driven.index(row)
-            self._found[row] = []
+            places = [sum(coordinates.sizes[:2]) + coordinates.driven.index(row) for row in rows]
+            self._found[rows] = []
             for level in LEVELS:
                 at = z.copy()
-                at[i] = coordinates.unit(i, level * coordinates.value(i, float(z[i])))
-                self._found[row] += self._at(at)
-        return self._found[row]
+                for i in places:
+                    at[i] = coordinates.unit(i, level * coordinates.value(i, float(z[i])))
+                self._found[rows] += self._at(at)
+        return self._found[rows]
 
     def _at(self, z: np.ndarray) -> list[Level]:
         windows = self.search.plan.windows

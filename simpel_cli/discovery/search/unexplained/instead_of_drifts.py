@@ -1,0 +1,88 @@
+"""Effects that were chosen for what a parameter that is no constant does.
+
+Where a parameter drifts, a search finds effects that do a part of what the drift does. So they are fitted once more beside it,
+
+    d(x)/dt = f(x, u, p + c (t/T - 1/2))  over an episode of length T,
+
+in a small program, of which t/T - 1/2 is an input. What earns no place there was chosen for the drift.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.search.smaller import carried_windows, fitted_again, small_search
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
+from simpel_cli.filtering.setup import Setup, key_of, members
+from simulators.expression import Symbol
+from simulators.model import Model
+from simulators.quantity import Quantity
+
+PROGRESS, SIZE = "progress_of_the_episode", "drift_of_"
+
+
+def with_drift(model: Model, parameter: str) -> Model:
+    """Return the simulator of which a parameter changes by `drift_of_PARAMETER` from the begin of an episode to its end."""
+    place = [q.name for q in model.params].index(parameter)
+    q, own, given = model.params[place], len(model.params), len(model.inputs)
+    span = q.high - q.low
+    change = Quantity(f"{SIZE}{parameter}", q.unit, -span, span)
+
+    def at(u: Symbol, p: Symbol) -> tuple[Symbol, Symbol]:
+        moved = p[:own]
+        moved[place] = p[place] + p[own] * u[given]
+        return u[:given], moved
+
+    def rhs(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
+        return model.rhs(x, *at(u, p))
+
+    def output(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
+        return model.output(x, *at(u, p))
+
+    return replace(
+        model, params=(*model.params, change), inputs=(*model.inputs, Quantity(PROGRESS, "1", -0.5, 0.5)), rhs=rhs,
+        output=output, covariates=model.covariates | {PROGRESS: PROGRESS},
+    )  # fmt: skip
+
+
+def with_progress(recording: Recording) -> Recording:
+    """Return measurements with an input more: how far every row is in its episode, from -1/2 to 1/2."""
+
+    def further(e: Episode) -> Episode:
+        passed = e.time - e.time[0]
+        return e._replace(inputs=np.column_stack([e.inputs, passed / max(float(passed[-1]), 1e-300) - 0.5]))
+
+    train, test = (tuple(map(further, part)) for part in (recording.train, recording.test))
+    return recording._replace(train=train, test=test)
+
+
+def needed_beside(
+    drift: Drift, attach: Callable[..., Setup], model: Model, recording: Recording, search: Search, chosen: Trial,
+    side_by_side: int,
+) -> list[int]:  # fmt: skip
+    """Return the places of the chosen effects that earn their place beside a drift.
+
+    Args:
+        drift: a parameter that drifts over every episode.
+        attach: (model, recording, kept) -> the setup of a program with these terms alone.
+        model: in which the effects were chosen.
+        recording: its measurements.
+        search: in which they were chosen.
+        chosen: they.
+        side_by_side: fits that run side by side.
+    """
+    if drift.how != OVER or model.groups:
+        return list(range(len(chosen.terms)))
+    kept = frozenset(key_of(search.terms[t]) for t in chosen.terms)
+    given: dict[str, Any] = {"recording": with_progress(recording), "kept": kept}
+    plan = attach(with_drift(model, drift.parameter), **given)
+    windows = carried_windows(search.plan, plan)._replace(u=plan.windows.u)
+    plan = plan._replace(windows=windows, spare=None)
+    small = small_search(plan, side_by_side, sum(len(search.all_rows(t)) for t in chosen.terms) + members(plan))
+    beside, *_ = small.prune(fitted_again(small, search, chosen))
+    left = {key_of(small.terms[t]) for t in beside.terms}
+    return [i for i, t in enumerate(chosen.terms) if key_of(search.terms[t]) in left]
