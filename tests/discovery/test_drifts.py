@@ -95,6 +95,8 @@ def test_a_drift_stands_for_effects_that_explain_no_more() -> None:
         base._replace(terms=(0,), optimum=base.optimum._replace(log_evidence=float(base.optimum.log_evidence + gain)))
         for gain in (found.gain, found.gain + 10)
     )
+    assert not stands_for(found, base, some)  # it is fitted beside them
+    found = found._replace(how=BETWEEN)
     assert stands_for(found, base, some)
     assert not stands_for(found, base, more)
     assert not stands_for(found, base, base)  # there are no effects
@@ -110,7 +112,7 @@ def test_a_simulator_whose_parameter_drifts_is_the_one_with_its_value_at_every_r
     for progress in (-0.5, 0.0, 0.3):
         found = moving.function()(x, [*u, progress], [1.2, 0.4])[0]
         np.testing.assert_allclose(found, model.function()(x, u, [1.2 + 0.4 * progress])[0])
-    recording = with_progress(pushed(0.0))
+    recording = with_progress(pushed(0.0), model)
     assert recording.train[0].inputs.shape == (60, 2)
     np.testing.assert_allclose(recording.train[0].inputs[:, 1], np.linspace(-0.5, 0.5, 60))
 

@@ -7,7 +7,8 @@ import pytest
 from linear_plant import LOAD, model, recording
 
 from simpel_cli.filtering.likelihood import fit
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, MOST, ROUND, Course, Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.likelihood.fit import MOST, ROUND, Fitter, Hypothesis, Optimum
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE, Course
 from simpel_cli.filtering.race import HOPED, MARGIN, PATIENCE, Race, hopeful
 from simpel_cli.filtering.setup import setup
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from simpel_cli.filtering.likelihood.fit import ENOUGH, _proposed
+from simpel_cli.filtering.likelihood.steps import ENOUGH, proposed
 
 CURVATURE = 400.0
 
@@ -28,7 +28,7 @@ def test_steps_end_where_a_quadratic_is_least_inside_the_box(seed: int) -> None:
     )  # fmt: skip
     loss = lambda z: 0.5 * float((z - deepest) @ fisher @ (z - deepest))  # noqa: E731
     for _ in range(40):
-        following, promised = _proposed(
+        following, promised = proposed(
             part, jnp.asarray(fisher @ (part - deepest)), jnp.asarray(fisher), jnp.asarray(1e-6), moves
         )
         assert float(following.min()) >= 0
@@ -42,7 +42,7 @@ def test_steps_end_where_a_quadratic_is_least_inside_the_box(seed: int) -> None:
 
 def test_what_does_not_move_and_what_is_held_at_a_wall_stay() -> None:
     part = jnp.array([0.0, 0.5, 0.3])
-    following, _ = _proposed(
+    following, _ = proposed(
         part, jnp.array([10.0, 10.0, 10.0]), 100 * jnp.eye(3), jnp.asarray(0.0), jnp.array([True, False, True])
     )
     np.testing.assert_allclose(following, [0.0, 0.5, 0.2], atol=1e-6)

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis, Optimum
+from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
 from simpel_cli.filtering.setup import Setup
 from simulators.effects.term import DELAY
 

@@ -23,7 +23,8 @@ from simpel_cli.data import Recording
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import SETTLE, Assessor, with_lost
 from simpel_cli.filtering.independent_parts import correlation_time
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE, Hypothesis
+from simpel_cli.filtering.likelihood.fit import Hypothesis
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
 from simpel_cli.filtering.measurements.windows import LEAST_EPISODES, Windows, thinned
 from simpel_cli.filtering.setup import Setup, whole_windows
 from simulators.effects.term import ON_SENSOR, SENSOR

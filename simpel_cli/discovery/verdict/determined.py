@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
 from simulators.groups import MEMBER, SPREAD
 
 PART = 0.2  # of the largest component: smaller ones do not take part

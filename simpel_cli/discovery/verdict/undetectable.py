@@ -16,7 +16,7 @@ import numpy as np
 
 from simpel_cli.data.recording import Episode
 from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
 
 FAULTS = ("kinematics", "stale")  # checks of the data that can hide or feign an effect
 SHOWN = 6  # names in a sentence

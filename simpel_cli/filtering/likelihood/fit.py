@@ -6,7 +6,7 @@
 In unit coordinates every eigenvalue of H is at least 12, the inverse variance of a uniform prior: a shape that the data
 do not see earns nothing. An unknown at its bound loses log 2: half of its mass lies outside.
 
-Reference: Levenberg (1944), Marquardt (1963); Kass and Raftery (1995), Bayes factors, eq. 5.
+Reference: Kass and Raftery (1995), Bayes factors, eq. 5.
 """
 
 import os
@@ -23,19 +23,16 @@ from jaxtyping import Array
 
 from simpel_cli.filtering.likelihood.coordinates import Coordinates
 from simpel_cli.filtering.likelihood.filter import MOST_KEPT
+from simpel_cli.filtering.likelihood.steps import FIRST_DAMPING, LEAST_CURVATURE, REFUSED, Course, stepped
 from simpel_cli.filtering.likelihood.track import Filter, Noise
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.runs.programs import Program
 
-LEAST_CURVATURE = 12.0
 AT_BOUND = 1e-4
-ENOUGH = 0.02  # nats: a step that promises less ends a fit
-MOST_REJECTED = 6  # steps in a row
 MOST = 40  # iterations
 ROUND = 4  # iterations after which fits that have arrived make room for others
 SLOW = 0.1  # nats: a round that gains less, with a step that helped at its end, ends a fit that crawls along a valley
-LEGS = 8  # of a step, between which unknowns meet the ends of their ranges
-FIRST_DAMPING = 1e-2
+STUCK = 1.0  # nats: a fit that ends where a Newton step promises more goes on once, as if it began there
 POINTS = 16  # windows of all fits of one program: of more, what a row leaves behind does not stay in the cache
 
 
@@ -96,24 +93,6 @@ Watch = Callable[[int, int], None]
 Hopes = Callable[[Sequence[Optimum]], Sequence[bool]]  # where fits stand -> which are worth going on with
 
 
-class Course(NamedTuple):
-    """Where the fits of a batch of hypotheses stand; NumPy outside the program, JAX inside; leading axis: hypotheses."""
-
-    z: Any  # (L, n) where they started
-    index: Any  # (L, width) of z that move: every level of noise, in order, then parameters of model and effects
-    moves: Any  # (L, width) False: padding
-    weight: Any  # (L, W)
-    trial: Any  # (L, width) the next point to try
-    part: Any  # (L, width) the best so far
-    loss: Any
-    gradient: Any
-    fisher: Any
-    damping: Any
-    iteration: Any
-    done: Any
-    rejected: Any
-
-
 class Fitter:
     """Fits hypotheses; one compiled program for a batch of at most `side_by_side`, with up to `width` free unknowns each.
 
@@ -139,7 +118,8 @@ class Fitter:
         if not hypotheses:
             return []
         state = self._begin(hypotheses)
-        waiting, left = np.arange(len(hypotheses)), np.zeros(len(hypotheses), bool)
+        waiting = np.arange(len(hypotheses))
+        left, anew = np.zeros((2, len(hypotheses)), bool)
         while waiting.size:
             if self.watch is not None:
                 self.watch(len(hypotheses) - len(waiting), len(hypotheses))
@@ -154,7 +134,13 @@ class Fitter:
             gained = np.subtract(before, state.loss[waiting], where=both, out=np.full(len(waiting), np.inf))
             # a step that helped with the damping of a refusal is short, whatever is left to gain
             crawls = (gained < SLOW) & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
-            waiting = waiting[~state.done[waiting] & ~crawls & (state.iteration[waiting] < most)]
+            over = state.done[waiting] | crawls
+            # refusals damp steps until they promise nothing: once more from there, with a step of usual length
+            once = waiting[over & ~anew[waiting]].tolist()
+            again = [i for i in once if STUCK < self._optimum(state, i, hypotheses[i].free).step < np.inf]
+            state.done[again], state.rejected[again], anew[again] = False, 0, True
+            state.trial[again], state.damping[again] = state.part[again], FIRST_DAMPING / REFUSED
+            waiting = waiting[(~over | np.isin(waiting, again)) & (state.iteration[waiting] < most)]
             if hopes is not None and waiting.size:
                 hopeful = hopes(self._optima(state, hypotheses))
                 left[waiting] = [not hopeful[i] for i in waiting]
@@ -271,7 +257,7 @@ def _advance(
     def body(carry: tuple[Course, Array]) -> tuple[Course, Array]:
         now, count = carry
         found = evaluate(now.trial)
-        return jax.vmap(_stepped)(now, *found), count + 1
+        return jax.vmap(stepped)(now, *found), count + 1
 
     def going(carry: tuple[Course, Array]) -> Array:
         return (carry[1] < most) & ~jnp.all(carry[0].done)
@@ -347,50 +333,3 @@ def _evaluate(
     fisher = jnp.where(both_move, fisher, 0.0) + jax.vmap(jnp.diag)(inverse_variance)
     finite = jnp.isfinite(loss) & jnp.isfinite(gradient).all(axis=1) & jnp.isfinite(fisher).all(axis=(1, 2))
     return jnp.where(finite, loss, jnp.inf), gradient, fisher
-
-
-def _stepped(now: Course, new_loss: Array, new_gradient: Array, new_fisher: Array) -> Course:
-    """One hypothesis after its trial was evaluated: taken or not, and the next trial."""
-    better = new_loss < now.loss
-    keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
-    part, loss = keep(now.trial, now.part), keep(new_loss, now.loss)
-    gradient, fisher = keep(new_gradient, now.gradient), keep(new_fisher, now.fisher)
-    damping = jnp.where(better, jnp.maximum(now.damping / 5, 1e-6), jnp.minimum(now.damping * 8, 1e8))
-    rejected = jnp.where(better, 0, now.rejected + 1)
-    following, promised = _proposed(part, gradient, fisher, damping, now.moves)
-    done = (promised < ENOUGH) | (rejected >= MOST_REJECTED)
-    after = now._replace(
-        trial=following, part=part, loss=loss, gradient=gradient, fisher=fisher, damping=damping,
-        iteration=now.iteration + 1, done=done, rejected=rejected,
-    )  # fmt: skip
-    return jax.tree.map(lambda old, new: jnp.where(now.done, old, new), now, after)
-
-
-def _proposed(part: Array, gradient: Array, fisher: Array, damping: Array, moves: Array) -> tuple[Array, Array]:
-    """Return the next trial and the gain that the quadratic model promises, inside the unit box.
-
-    Where a step meets a wall it ends, what met it stays there, and the others are solved for again: every leg gains. Were the
-    step only cut to the box, what is left of it could promise nothing far from any optimum, and end the fit there.
-
-    Reference: Nocedal and Wright (2006), Numerical optimization, section 16.5 (active sets).
-    """
-    out = ((part <= 0) & (gradient > 0)) | ((part >= 1) & (gradient < 0)) | ~moves
-
-    def leg(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        step, free = carry
-        matrix = jnp.where(free[:, None] & free[None, :], fisher, 0.0)
-        scale = jnp.maximum(jnp.diag(matrix), LEAST_CURVATURE)
-        matrix = matrix + jnp.diag(jnp.where(free, (damping + 1e-9) * scale, 1.0))
-        own = -jnp.linalg.solve(matrix, jnp.where(free, gradient + fisher @ step, 0.0))
-        longest = jnp.max(jnp.abs(own))
-        own = own * jnp.minimum(1.0, 0.3 / jnp.maximum(longest, 1e-12))  # a third of the prior's range at most
-        room = jnp.where(own > 0, 1 - part - step, part + step)
-        share = jnp.where(own != 0, room / jnp.maximum(jnp.abs(own), 1e-300), jnp.inf)
-        least = jnp.minimum(jnp.min(share), 1.0)
-        # a leg that meets no wall is the last one
-        return step + least * own, free & (share > least) & (least < 1)
-
-    step, _ = jax.lax.fori_loop(0, LEGS, leg, (jnp.zeros_like(part), ~out))
-    following = jnp.clip(part + step, 0.0, 1.0)
-    step = following - part
-    return following, -(gradient @ step) - 0.5 * step @ fisher @ step

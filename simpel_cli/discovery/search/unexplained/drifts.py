@@ -56,9 +56,12 @@ class Drift(NamedTuple):
 
 
 def stands_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:
-    """Whether a drift of the simulator alone explains as much as all the effects that were chosen instead."""
+    """Whether episodes that differ, in the simulator alone, explain as much as all the effects that were chosen instead.
+
+    What drifts over an episode is fitted beside the effects (`instead_of_drifts`).
+    """
     effects = chosen.optimum.log_evidence - base.optimum.log_evidence
-    return drift is not None and bool(chosen.terms) and drift.gain > effects - TIE
+    return drift is not None and drift.how == BETWEEN and bool(chosen.terms) and drift.gain > effects - TIE
 
 
 def may_stand_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:

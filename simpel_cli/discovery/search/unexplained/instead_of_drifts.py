@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import casadi
 import numpy as np
 
 from simpel_cli.data.recording import Episode, Recording
@@ -19,6 +20,7 @@ from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
 from simpel_cli.filtering.setup import Setup, key_of, members
 from simulators.expression import Symbol
+from simulators.groups import slots_of
 from simulators.model import Model
 from simulators.quantity import Quantity
 
@@ -28,14 +30,14 @@ PROGRESS, SIZE = "progress_of_the_episode", "drift_of_"
 def with_drift(model: Model, parameter: str) -> Model:
     """Return the simulator of which a parameter changes by `drift_of_PARAMETER` from the begin of an episode to its end."""
     place = [q.name for q in model.params].index(parameter)
-    q, own, given = model.params[place], len(model.params), len(model.inputs)
+    q, own, before = model.params[place], len(model.params), _before_groups(model)
     span = q.high - q.low
     change = Quantity(f"{SIZE}{parameter}", q.unit, -span, span)
 
     def at(u: Symbol, p: Symbol) -> tuple[Symbol, Symbol]:
         moved = p[:own]
-        moved[place] = p[place] + p[own] * u[given]
-        return u[:given], moved
+        moved[place] = p[place] + p[own] * u[before]
+        return casadi.vertcat(u[:before], u[before + 1 :]), moved
 
     def rhs(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
         return model.rhs(x, *at(u, p))
@@ -43,21 +45,28 @@ def with_drift(model: Model, parameter: str) -> Model:
     def output(x: Symbol, u: Symbol, p: Symbol) -> Symbol:
         return model.output(x, *at(u, p))
 
+    inputs = (*model.inputs[:before], Quantity(PROGRESS, "1", -0.5, 0.5), *model.inputs[before:])
     return replace(
-        model, params=(*model.params, change), inputs=(*model.inputs, Quantity(PROGRESS, "1", -0.5, 0.5)), rhs=rhs,
-        output=output, covariates=model.covariates | {PROGRESS: PROGRESS},
+        model, params=(*model.params, change), inputs=inputs, rhs=rhs, output=output,
+        covariates=model.covariates | {PROGRESS: PROGRESS},
     )  # fmt: skip
 
 
-def with_progress(recording: Recording) -> Recording:
-    """Return measurements with an input more: how far every row is in its episode, from -1/2 to 1/2."""
+def with_progress(recording: Recording, model: Model) -> Recording:
+    """Return measurements of a model with an input more: how far every row is in its episode, from -1/2 to 1/2."""
+    before = _before_groups(model)
 
     def further(e: Episode) -> Episode:
         passed = e.time - e.time[0]
-        return e._replace(inputs=np.column_stack([e.inputs, passed / max(float(passed[-1]), 1e-300) - 0.5]))
+        return e._replace(inputs=np.insert(e.inputs, before, passed / max(float(passed[-1]), 1e-300) - 0.5, axis=1))
 
     train, test = (tuple(map(further, part)) for part in (recording.train, recording.test))
     return recording._replace(train=train, test=test)
+
+
+def _before_groups(model: Model) -> int:
+    """Return the number of inputs in front of those that say of which group a row is."""
+    return len(model.inputs) - sum(len(slots) for slots in slots_of(model))
 
 
 def needed_beside(
@@ -75,10 +84,10 @@ def needed_beside(
         chosen: they.
         side_by_side: fits that run side by side.
     """
-    if drift.how != OVER or model.groups:
+    if drift.how != OVER:
         return list(range(len(chosen.terms)))
     kept = frozenset(key_of(search.terms[t]) for t in chosen.terms)
-    given: dict[str, Any] = {"recording": with_progress(recording), "kept": kept}
+    given: dict[str, Any] = {"recording": with_progress(recording, model), "kept": kept}
     plan = attach(with_drift(model, drift.parameter), **given)
     windows = carried_windows(search.plan, plan)._replace(u=plan.windows.u)
     plan = plan._replace(windows=windows, spare=None)

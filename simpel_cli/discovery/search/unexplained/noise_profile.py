@@ -19,8 +19,8 @@ import numpy as np
 
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
-from simpel_cli.filtering.likelihood.fit import LEAST_CURVATURE
 from simpel_cli.filtering.likelihood.latent_force import Forces
+from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
 from simpel_cli.filtering.likelihood.track import Track
 from simpel_cli.filtering.tracks import Tracks
 
