@@ -24,8 +24,8 @@ from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_ro
 from simpel_cli.discovery.search.smaller import fitter_of
 from simpel_cli.discovery.search.trials import TIE, Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance, time_dependent_disturbance
-from simpel_cli.discovery.search.unexplained.drifts import Drift, drifting, may_stand_for, stands_for
-from simpel_cli.discovery.search.unexplained.instead_of_drifts import needed_beside
+from simpel_cli.discovery.search.unexplained.drifts import BETWEEN, Drift, drifting, stands_for
+from simpel_cli.discovery.search.unexplained.instead_of_drifts import needed_beside, suspected
 from simpel_cli.discovery.search.unexplained.memories import Memory, worth_a_search
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, windows_for
@@ -352,7 +352,7 @@ def _with(
     if by_simulations is None and not ground.budget.over("functions of two arguments"):
         selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
     alone_levels = NoiseProfile(search, assessor, selection.base)
-    alone = drifting(alone_levels) if selection.chosen.terms else None
+    alone = drifting(alone_levels, (BETWEEN,)) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
         again = asked_again(chosen_of(found, selection), *promising, attach_said, options, terminal)
@@ -363,21 +363,18 @@ def _with(
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
         selection, gates = cut(search, selection, [])._replace(remainder=None), []
         levels = NoiseProfile(search, assessor, selection.chosen)
-    drift = drifting(levels)
-    suspect = drift or (alone if may_stand_for(alone, selection.base, selection.chosen) else None)
-    if (
-        suspect
-        and selection.chosen.terms
-        and by_simulations is None
-        and not ground.budget.over("effects beside a drift")
-    ):
-        named = saying(model, between_rows)
-        needed = needed_beside(suspect, attach, named, ground.clean.recording, search, selection.chosen, options.lanes)
-        if idle := [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in needed]:
+    if by_simulations is None and not (selection.chosen.terms and ground.budget.over("effects beside a drift")):
+        suspect = suspected(levels, alone_levels, selection)
+        needed = [*range(len(selection.chosen.terms))] if suspect is None else needed_beside(
+            suspect, attach, saying(model, between_rows), ground.clean.recording, search, selection.chosen, options.lanes
+        )  # fmt: skip
+        if suspect and (
+            idle := [search.terms[t].label for i, t in enumerate(selection.chosen.terms) if i not in needed]
+        ):
             terminal.line(f"{suspect.words}: beside that {' and '.join(idle)} earn no place", "search")
             selection, gates = cut(search, selection, needed)._replace(remainder=None), [gates[i] for i in needed]
             levels = NoiseProfile(search, assessor, selection.chosen)
-            drift = drifting(levels)
+    drift = drifting(levels)
     disturbance = None if selection.remainder else time_dependent_disturbance(levels)
     known = max(selection.remainder[1] if selection.remainder else 0.0, disturbance.gain if disturbance else 0.0)
     if drift is not None and drift.gain < known - TIE:

@@ -117,22 +117,26 @@ def test_a_simulator_whose_parameter_drifts_is_the_one_with_its_value_at_every_r
     np.testing.assert_allclose(recording.train[0].inputs[:, 1], np.linspace(-0.5, 0.5, 60))
 
 
-@pytest.mark.parametrize("drift", [0.3, 0.0])
-def test_an_effect_that_a_search_takes_for_a_drift_earns_no_place_beside_it(drift: float) -> None:
-    """A softer motor at speed is a part of what a motor does that grows weaker while the cart goes faster."""
+@pytest.mark.parametrize(("drift", "drag", "low"), [(-0.3, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 1.6e-5, 2.8)])
+def test_an_effect_that_a_search_takes_for_a_drift_earns_no_place_beside_it(
+    drift: float, drag: float, low: float
+) -> None:
+    """A softer motor at speed is a part of what a motor does that grows weaker while the cart goes faster.
+
+    A drag that explains little more than a drift would, 51 nats and 42, stays.
+    """
     c = {"range": [-1, 1], "unit": "1/m", "starts": [0.02, -0.02]}
-    drag = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": c})
-    recording, model = pushed(-drift, drag=0.0 if drift else 0.02, low=0.0), cart(0.8, 1.8)
-    search = searched(recording, [drag], model)
+    effect = Expression("drag", acts_on="v", term="-c*v*abs(v)", parameters={"c": c})
+    recording, model = pushed(drift, drag=drag, low=low), cart(0.8, 1.8)
+    search = searched(recording, [effect], model)
     (chosen, *_) = (t for t in search.add(search.base(), [0]).trials if search.terms[t.terms[-1]].effect == "drag")
     assert chosen.optimum.log_evidence > search.base().optimum.log_evidence + 5
 
     def attach(model: Model, *, recording: Recording, kept: frozenset) -> Setup:
-        return setup(model, recording, (), [drag], 1, kept=kept)
+        return setup(model, recording, (), [effect], 1, kept=kept)
 
     found = Drift("b", OVER, -0.3, "m/s^2/V", "v", 50.0)
     assert needed_beside(found, attach, model, recording, search, chosen, 1) == ([] if drift else [0])
-    assert needed_beside(found._replace(how=BETWEEN), attach, model, recording, search, chosen, 1) == [0]
 
 
 def test_a_drift_may_stand_for_effects_where_it_promises_half_of_what_they_earn() -> None:

@@ -200,11 +200,14 @@ def recorded(rows: pd.DataFrame) -> Recording:
     return Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), {"T": 0.05}, (), (Check("c", True, ""),), ())
 
 
-@pytest.mark.parametrize(("k", "drift"), [(WALL["k"], 0.0), (0.0, 0.3), (0.0, 0.4)])
-def test_a_state_is_asked_only_where_it_promises_more_than_a_drift(k: float, drift: float) -> None:
-    """A slow state fits a slow change, too."""
+@pytest.mark.parametrize(
+    ("k", "tau", "drift"),
+    [(0.03, 60.0, 0.0), (0.03, 300.0, 0.0), (0.03, 900.0, 0.0), (0.0, 60.0, 0.3), (0.0, 60.0, 0.4)],
+)
+def test_a_state_is_asked_only_where_it_promises_more_than_a_drift(k: float, tau: float, drift: float) -> None:
+    """A slow state fits a slow change, too; a wall that is as slow as an episode is long is asked all the same."""
     model = heater()
-    plan = setup(model, recorded(heaters(k, WALL["tau"], drift=drift)), (), [], 1, kept=frozenset())
+    plan = setup(model, recorded(heaters(k, tau, drift=drift)), (), [], 1, kept=frozenset())
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=6))
     levels = NoiseProfile(search, Assessor(plan, 10), search.base())
     state = {"z": {"rate": "(given - z)/tau", "unit": "U", "range": ["-U", "U"], "begins": "given"}}

@@ -79,7 +79,8 @@ def preferences(search: Search, at: Trial) -> dict[str, Preference]:
         at: the model, fitted with the ways in `search.plan.start`.
     """
     late = [t for t in at.terms if search.terms[t].kind in LATE]
-    models = [at.terms, *(tuple(t for t in at.terms if t != one) for one in late)]
+    gone = [(one,) for one in late] + ([tuple(late)] if len(late) > 1 else [])
+    models = [at.terms, *(tuple(t for t in at.terms if t not in those) for those in gone)]
     price = [sum(asked_for(k + 1) for k in range(len(terms))) for terms in models]
 
     def worth(fits: Sequence[Optimum]) -> float:

@@ -119,7 +119,7 @@ class Fitter:
             return []
         state = self._begin(hypotheses)
         waiting = np.arange(len(hypotheses))
-        left, anew = np.zeros((2, len(hypotheses)), bool)
+        left, anew, arrived = np.zeros((3, len(hypotheses)), bool)
         while waiting.size:
             if self.watch is not None:
                 self.watch(len(hypotheses) - len(waiting), len(hypotheses))
@@ -136,17 +136,19 @@ class Fitter:
             crawls = (gained < SLOW) & (state.rejected[waiting] == 0) & (state.damping[waiting] <= FIRST_DAMPING)
             over = state.done[waiting] | crawls
             # refusals damp steps until they promise nothing: once more from there, with a step of usual length
-            once = waiting[over & ~anew[waiting]].tolist()
+            once = waiting[over & ~anew[waiting] & (state.iteration[waiting] < most)].tolist()
             again = [i for i in once if STUCK < self._optimum(state, i, hypotheses[i].free).step < np.inf]
+            arrived |= state.done
             state.done[again], state.rejected[again], anew[again] = False, 0, True
             state.trial[again], state.damping[again] = state.part[again], FIRST_DAMPING / REFUSED
             waiting = waiting[(~over | np.isin(waiting, again)) & (state.iteration[waiting] < most)]
             if hopes is not None and waiting.size:
                 hopeful = hopes(self._optima(state, hypotheses))
-                left[waiting] = [not hopeful[i] for i in waiting]
+                left[waiting] = [not hopeful[i] and i not in again for i in waiting]
                 waiting = waiting[~left[waiting]]
         if self.watch is not None:
             self.watch(0, 0)
+        state.done[:] |= arrived  # also where it went on once more, and was slow
         return [o._replace(left=bool(gone)) for o, gone in zip(self._optima(state, hypotheses), left, strict=True)]
 
     def _optima(self, state: Course, hypotheses: Sequence[Hypothesis]) -> list[Optimum]:

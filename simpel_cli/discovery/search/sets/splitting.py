@@ -6,7 +6,7 @@ name is wrong where the data show little of those, and one effect is the shorter
 
 import numpy as np
 
-from simpel_cli.discovery.search.trials import SAME, TIE, Search, Trial
+from simpel_cli.discovery.search.trials import SAME, TIE, Search, Trial, asked
 from simpel_cli.filtering.likelihood.fit import Hypothesis, Optimum
 from simulators.effects import Term
 
@@ -17,7 +17,7 @@ FITTED = 8  # pairs: what promises to saturate a signal promises too much, and i
 
 
 def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, Term]]:
-    """Return the pairs that fit at least as well as one chosen effect: a special case of it where it acts, and another effect.
+    """Return the pairs that do as well as one chosen effect, or little better: a special case where it acts, and another one.
 
     Neither alone does, and the other one is no more general form of the special case: that would be a rival by itself.
 
@@ -51,7 +51,8 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
         for t in _promising(search, before, others, A_GOOD_PART * (before.optimum.loss - whole.loss)):
             pair, alone = (*less, t), (*rest, t)
             both = _best(search, pair, search.hypotheses(pair, t, before.optimum.z))
-            if not (_as_good(both, whole) or _better(both, whole)):
+            ahead = both.log_evidence - whole.log_evidence
+            if not (_as_good(both, whole) or 0 < ahead <= asked(2)):  # what one effect more has to earn, it did not
                 continue
             by_itself = _best(search, alone, search.hypotheses(alone, t, off))
             known = any({special, t} == {*earlier} for earlier in found)

@@ -70,13 +70,24 @@ def may_stand_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:
     return drift is not None and bool(chosen.terms) and drift.gain > HALF * effects
 
 
-def drifting(levels: NoiseProfile) -> Drift | None:
-    """Return the parameter that is no constant for which the data ask most; None where there is none."""
+def drifting(levels: NoiseProfile, ways: Sequence[str] = (OVER, BETWEEN)) -> Drift | None:
+    """Return the parameter that is no constant for which the data ask most; None where there is none.
+
+    Args:
+        levels: of a model.
+        ways: in which it may be none.
+    """
+    found = (d for d in levels.once("drifts", lambda: _drifts(levels)) if d.how in ways and d.gain > CERTAIN)
+    return max(found, key=lambda one: one.gain, default=None)
+
+
+def _drifts(levels: NoiseProfile) -> list[Drift]:
+    """Return what every parameter earns as no constant, either way, at every level of the noise."""
     plan, chosen = levels.search.plan, levels.chosen
     model = plan.augmented.model
     names = [i for i, q in enumerate(model.params) if q.role not in (SPREAD, MEMBER) and i in chosen.optimum.free]
     if not names or not model.states:
-        return None
+        return []
     z = chosen.optimum.z
     p = np.array([plan.coordinates.value(i, float(z[i])) for i in range(plan.coordinates.sizes[0])])
     slopes = _slopes(plan.augmented, names)
@@ -106,8 +117,7 @@ def drifting(levels: NoiseProfile) -> Drift | None:
                     by_itself = alone.get((q.name, how))
                     acts_on = model.states[rows[0]].name if len(rows) == 1 or by_itself is None else by_itself.acts_on
                     found.append(Drift(q.name, how, size, q.unit, acts_on, float(level.reached + gain - base)))
-    best = max(found, key=lambda one: one.gain, default=None)
-    return best if best is not None and best.gain > CERTAIN else None
+    return found
 
 
 def _earned(level: Level, columns: np.ndarray) -> tuple[float, np.ndarray]:

@@ -15,9 +15,12 @@ import casadi
 import numpy as np
 
 from simpel_cli.data.recording import Episode, Recording
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.smaller import carried_windows, fitted_again, small_search
-from simpel_cli.discovery.search.trials import Search, Trial
-from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
+from simpel_cli.discovery.search.trials import TIE, Search, Trial
+from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift, drifting, may_stand_for
+from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Setup, key_of, members
 from simulators.expression import Symbol
 from simulators.groups import slots_of
@@ -69,6 +72,24 @@ def _before_groups(model: Model) -> int:
     return len(model.inputs) - sum(len(slots) for slots in slots_of(model))
 
 
+def suspected(levels: NoiseProfile, alone: NoiseProfile, selection: Selection) -> Drift | None:
+    """Return the drift over every episode that may stand for chosen effects: beside them, or in their place.
+
+    Args:
+        levels: of the chosen model.
+        alone: of the simulator.
+        selection: what was chosen.
+    """
+    if not selection.chosen.terms:
+        return None
+    instead = drifting(alone, (OVER,))
+    instead = instead if may_stand_for(instead, selection.base, selection.chosen) else None
+    found = drifting(levels, (OVER,)) or instead
+    # where a function that a gate has accepted explains more, effects are not judged without it
+    known = selection.remainder[1] if selection.remainder else 0.0
+    return None if found is None or found.gain < known - TIE else found
+
+
 def needed_beside(
     drift: Drift, attach: Callable[..., Setup], model: Model, recording: Recording, search: Search, chosen: Trial,
     side_by_side: int,
@@ -76,7 +97,7 @@ def needed_beside(
     """Return the places of the chosen effects that earn their place beside a drift.
 
     Args:
-        drift: a parameter that drifts over every episode.
+        drift: a parameter that drifts over every episode. It has to do as well as the effects that go.
         attach: (model, recording, kept) -> the setup of a program with these terms alone.
         model: in which the effects were chosen.
         recording: its measurements.
@@ -84,14 +105,20 @@ def needed_beside(
         chosen: they.
         side_by_side: fits that run side by side.
     """
-    if drift.how != OVER:
-        return list(range(len(chosen.terms)))
     kept = frozenset(key_of(search.terms[t]) for t in chosen.terms)
     given: dict[str, Any] = {"recording": with_progress(recording, model), "kept": kept}
     plan = attach(with_drift(model, drift.parameter), **given)
     windows = carried_windows(search.plan, plan)._replace(u=plan.windows.u)
     plan = plan._replace(windows=windows, spare=None)
     small = small_search(plan, side_by_side, sum(len(search.all_rows(t)) for t in chosen.terms) + members(plan))
-    beside, *_ = small.prune(fitted_again(small, search, chosen))
+    together = fitted_again(small, search, chosen)
+    row = len(model.params)
+    constant = small.loud(together.optimum.z)
+    constant[row] = plan.start[row]
+    unmoved = tuple(i for i in together.optimum.free if i != row)
+    (alone,) = small.fitter([Hypothesis(constant, unmoved, small.ones)])
+    beside, *_ = small.prune(together)
+    if beside.optimum.log_evidence < alone.log_evidence - TIE:
+        return list(range(len(chosen.terms)))
     left = {key_of(small.terms[t]) for t in beside.terms}
     return [i for i, t in enumerate(chosen.terms) if key_of(search.terms[t]) in left]

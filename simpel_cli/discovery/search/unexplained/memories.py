@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 
 from simpel_cli.discovery.search.trials import TIE
-from simpel_cli.discovery.search.unexplained.drifts import drifting
+from simpel_cli.discovery.search.unexplained.drifts import OVER, drifting
 from simpel_cli.discovery.search.unexplained.noise_profile import Level, NoiseProfile, evidence
 from simpel_cli.filtering.likelihood.augmented import Augmented, augment
 from simpel_cli.filtering.likelihood.sensitivity import shifts
@@ -65,9 +65,9 @@ def worth_a_search(levels: NoiseProfile, alone: NoiseProfile, terms: Sequence[Te
 
 
 def _more_than_a_drift(levels: NoiseProfile, terms: Sequence[Term]) -> Memory | None:
-    """Return what is remembered unless a parameter that is no constant promises more: a slow state fits a slow change, too."""
+    """Return what is remembered unless a parameter that drifts promises more: a slow state fits a slow change, too."""
     found = remembered(levels, terms)
-    drift = None if found is None else drifting(levels)
+    drift = None if found is None else drifting(levels, (OVER,))
     return found if drift is None or found is None or found.gain > drift.gain else None
 
 

@@ -13,11 +13,12 @@ in evidence.
 Reference: Rao (1948); Bishop (2006), Pattern recognition and machine learning, eq. 3.86 (evidence of a linear model).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.trials import Answer, Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
@@ -58,6 +59,14 @@ class NoiseProfile:
             chosen.optimum.z, plan.windows
         )
         self._found: dict[tuple[int, ...], list[Level]] = {}
+        self._answers: dict[str, Any] = {}
+
+    def once(self, question: str, work: Callable[[], Answer]) -> Answer:
+        """Return what work comes to, which is not done again for the same question."""
+        if question not in self._answers:
+            self._answers[question] = work()
+        answer: Answer = self._answers[question]
+        return answer
 
     def __call__(self, *rows: int) -> list[Level]:
         """Return the levels at which the filter does not diverge.
