@@ -10,7 +10,12 @@ from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.drifts import BETWEEN, OVER, Drift, drifting, may_stand_for, stands_for
-from simpel_cli.discovery.search.unexplained.instead_of_drifts import needed_beside, with_drift, with_progress
+from simpel_cli.discovery.search.unexplained.instead_of_drifts import (
+    needed_beside,
+    suspected,
+    with_drift,
+    with_progress,
+)
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import dependence, remainder_of
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -150,3 +155,29 @@ def test_a_drift_may_stand_for_effects_where_it_promises_half_of_what_they_earn(
     assert not may_stand_for(found, base, more)
     assert not may_stand_for(found, base, base)
     assert not may_stand_for(None, base, some)
+
+
+def test_a_drift_is_suspected_beside_the_effects_or_in_their_place_unless_a_function_explains_more() -> None:
+    search = searched(pushed(0.15), [], cart(0.8, 1.8))
+    base, assessor = search.base(), Assessor(search.plan, 10)
+    alone = NoiseProfile(search, assessor, base)
+    found = drifting(alone, (OVER,))
+    assert found is not None
+    between = drifting(alone, (BETWEEN,))
+    assert between is None or between.gain < found.gain
+
+    def asked(gain: float, remainder: float = 0.0, levels: NoiseProfile | None = None) -> Drift | None:
+        chosen = Trial((0,), base.optimum._replace(log_evidence=float(base.optimum.log_evidence + gain)))
+        left: Any = (None, remainder) if remainder else None
+        return suspected(levels or alone, alone, Selection(base, chosen, (base, chosen), (), (), (), left))
+
+    class Quiet(NoiseProfile):
+        def __call__(self, *rows: int) -> list:
+            return []
+
+    none = Quiet(search, assessor, base)
+    assert asked(1e9) == found  # beside them, whatever they explain
+    assert asked(1.9 * found.gain, levels=none) == found
+    assert asked(2.1 * found.gain, levels=none) is None
+    assert asked(1e9, remainder=found.gain + 10) is None
+    assert suspected(alone, alone, Selection(base, base, (base,), (), (), (), None)) is None
