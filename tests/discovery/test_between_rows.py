@@ -9,7 +9,7 @@ from simpel_cli.data.recording import Episode, Recording
 from simpel_cli.discovery.search.between_rows import _better, asked_beside, in_words, preferences, settled, words_of
 from simpel_cli.discovery.search.calibration import prepared
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import ACCEPT, Search
+from simpel_cli.discovery.search.trials import Search
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, questions, setup, terms_of
 from simpel_cli.runs.console import Terminal
@@ -167,4 +167,6 @@ def test_a_delay_that_makes_up_for_the_wrong_way_is_not_in_its_favour() -> None:
     assert beside == {}  # it is said
     beside = asked_beside(attach, rotor(v="held"), search, chosen, 2)
     assert beside["u"].word == "held"
-    assert beside["u"].gain > ACCEPT
+    assert (
+        beside["u"].gain > 300
+    )  # 293 where a delay of nothing costs the held one its range, and what an effect has to earn
