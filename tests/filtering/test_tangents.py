@@ -34,6 +34,7 @@ CHAIN: dict[str, Any] = {
     "states": dict.fromkeys("wxyz", ANY), "inputs": {"u": ANY}, "parameters": UNKNOWN,
     "dynamics": {"w": "u - w - a*z*y", "x": "y", "y": "-b*sin(x) - a*y + z", "z": "w - z"},
 }  # fmt: skip
+FREE: dict[str, Any] = PENDULUM | {"inputs": {}, "dynamics": {"s": "v", "v": "-a*v*sqrt(0.1 + v*v) - a*b*sin(s)"}}
 LINEAR: dict[str, Any] = PENDULUM | {"inputs": {"u": ANY | {"between_rows": "linear"}}}
 
 
@@ -41,7 +42,7 @@ def late(kind: str, on: str) -> Expression:
     return Expression(kind, acts_on=on, operator=kind, parameters={"t": {"range": [0, 0.2], "unit": "s"}})
 
 
-def recording(states: list[str], uneven: bool) -> Recording:
+def recording(states: list[str], uneven: bool, driven: bool = True) -> Recording:
     random = np.random.default_rng(3)
     episodes = []
     for k in range(5):
@@ -49,7 +50,7 @@ def recording(states: list[str], uneven: bool) -> Recording:
         early = np.zeros((ROWS, len(states)))
         early[1:, -1] = random.uniform(0, 0.9, ROWS - 1) * np.diff(time)
         read = 0.3 + 0.05 * np.cumsum(random.normal(size=(ROWS, len(states))), axis=0)
-        inputs = random.normal(size=(ROWS, 1))
+        inputs = random.normal(size=(ROWS, 1))[:, : int(driven)]
         episodes.append(Episode(f"{k}", time, read, inputs, np.zeros((ROWS, 0)), late=early if uneven else None))
     noise = dict.fromkeys(states, 0.1)
     return Recording(tuple(episodes[:4]), tuple(episodes[4:]), (), noise, (), (Check("c", True, ""),), ())
@@ -66,12 +67,13 @@ INPUTS = [late("delay", "u"), late("lag", "u")]
         (PENDULUM, [*SENSORS, *INPUTS], True, REST), (LINEAR, [*SENSORS, *INPUTS], False, REST),
         (CHAIN, [late("sensor_delay", "x"), late("sensor_lag", "w"), *INPUTS], False, REST),
         (CHAIN, [late("sensor_delay", "x"), *INPUTS], True, EXACT),
+        (FREE, [], False, EXACT), (FREE, SENSORS, False, LATE), (FREE, SENSORS, True, LATE),
     ],
 )  # fmt: skip
 def test_derivatives_of_readings_are_those_of_differences(
     system: dict[str, Any], effects: list[Expression], uneven: bool, within: float
 ) -> None:
-    measured = recording(list(system["states"]), uneven)
+    measured = recording(list(system["states"]), uneven, bool(system["inputs"]))
     plan = setup(Declared("any", dt=DT, **system).model(), measured, (), effects, 2)
     y, ok, u, start, spread = (jnp.moveaxis(a[:POINTS], 0, -1) for a in plan.windows.arrays)
     n_p, points = plan.coordinates.sizes[0], y.shape[-1]

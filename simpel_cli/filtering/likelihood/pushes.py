@@ -287,7 +287,8 @@ def _stages_of(count: int) -> Array:
 
 def _side_by_side(stages: Array, one: Array | None) -> Array:
     """Return the stages of a row, (n, substeps, 3, ...), one after the other, and one more point behind them, (n, ...)."""
-    flat = stages.reshape(stages.shape[0], -1, *stages.shape[3:])
+    # n is 0 where there are no inputs: the size is said
+    flat = stages.reshape(stages.shape[0], stages.shape[1] * stages.shape[2], *stages.shape[3:])
     return flat if one is None else jnp.concatenate([flat, one[:, None]], axis=1)
 
 
