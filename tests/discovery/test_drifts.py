@@ -175,7 +175,7 @@ def test_a_drift_is_suspected_beside_the_effects_or_in_their_place_unless_a_func
         def __call__(self, *rows: int) -> list:
             return []
 
-    none = Quiet(search, assessor, base)
+    none = Quiet(search, assessor, base._replace(terms=(0,)))
     assert asked(1e9) == found  # beside them, whatever they explain
     assert asked(1.9 * found.gain, levels=none) == found
     assert asked(2.1 * found.gain, levels=none) is None

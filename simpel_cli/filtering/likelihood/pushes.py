@@ -21,9 +21,8 @@ from simpel_cli.filtering.likelihood.track import Held, Pushes, Track, Ways
 from simpel_cli.runs.settings import current_device
 
 SMALL = 3  # states of a model whose covariance follows the parameters
-NUMBERS = (
-    32768  # of the rates' slopes along a track that are read at once, for every direction: more do not fit a cache
-)
+# of the rates' slopes along a track that are read at once, for every direction: more do not fit a cache
+NUMBERS = 32768
 
 
 class Timing(NamedTuple):

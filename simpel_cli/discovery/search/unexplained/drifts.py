@@ -25,7 +25,7 @@ from simulators.groups import MEMBER, SPREAD
 OVER, BETWEEN = "over an episode", "from episode to episode"
 SIZES = (0.5, 0.15, 0.05, 0.015)  # of the parameter's range
 CERTAIN = 10.0  # nats that it has to earn: no episode was held out for it
-HALF = 0.5
+HALF = 0.5  # of what effects explain: fitted, a drift has explained twice what it promises to first order
 LEAST_EPISODES = 3  # of which one can say that they differ
 
 
@@ -77,8 +77,9 @@ def drifting(levels: NoiseProfile, ways: Sequence[str] = (OVER, BETWEEN)) -> Dri
         levels: of a model.
         ways: in which it may be none.
     """
-    found = (d for d in levels.once("drifts", lambda: _drifts(levels)) if d.how in ways and d.gain > CERTAIN)
-    return max(found, key=lambda one: one.gain, default=None)
+    key = "drifts", levels.chosen.terms, levels.chosen.optimum.z.tobytes()
+    found = levels.search.once(key, lambda: _drifts(levels))
+    return max((d for d in found if d.how in ways and d.gain > CERTAIN), key=lambda one: one.gain, default=None)
 
 
 def _drifts(levels: NoiseProfile) -> list[Drift]:
@@ -94,28 +95,24 @@ def _drifts(levels: NoiseProfile) -> list[Drift]:
     progress, own = _progress(plan.windows), _indicators(plan.windows.episode)
     ways = [OVER] + ([BETWEEN] if own.shape[1] >= LEAST_EPISODES else [])
     penalty = np.log(len(SIZES) * len(names) * len(ways))
-    driven = plan.coordinates.driven
-    found: list[Drift] = []
-    # a parameter of several rates made the noise of all of them necessary
-    for rows in [*((row,) for row in driven), *([driven] if len(driven) > 1 else [])]:
-        here = levels(*rows)
+    found = []
+    for row in plan.coordinates.driven:
+        here = levels(row)
         if not here:
             continue
         base = max(level.reached for level in here) + penalty
-        alone = {(d.parameter, d.how): d for d in sorted(found, key=lambda one: one.gain)}
         for level in here:
             moves = _moves(level, plan.augmented, slopes, p, progress, model.dt)  # (names, W, T, ny, 2)
             for k, i in enumerate(names):
                 q = model.params[i]
                 span = float(plan.coordinates.high[i] - plan.coordinates.low[i])
                 span = q.high - q.low if plan.coordinates.log[i] else span
-                over, same = moves[k, ..., 1], moves[k, ..., 0]
+                over, alike = moves[k, ..., 1], moves[k, ..., 0]
                 for how in ways:
-                    columns = over[..., None] if how == OVER else same[..., None] * own[:, None, None]
+                    columns = over[..., None] if how == OVER else alike[..., None] * own[:, None, None]
                     gain, weights = _earned(level, columns * span)
                     size = float(weights[0] * span if how == OVER else np.std(weights) * span)
-                    by_itself = alone.get((q.name, how))
-                    acts_on = model.states[rows[0]].name if len(rows) == 1 or by_itself is None else by_itself.acts_on
+                    acts_on = model.states[row].name
                     found.append(Drift(q.name, how, size, q.unit, acts_on, float(level.reached + gain - base)))
     return found
 

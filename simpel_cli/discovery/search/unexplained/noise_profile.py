@@ -13,12 +13,11 @@ in evidence.
 Reference: Rao (1948); Bishop (2006), Pattern recognition and machine learning, eq. 3.86 (evidence of a linear model).
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from simpel_cli.discovery.search.trials import Answer, Search, Trial
+from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.latent_force import Forces
 from simpel_cli.filtering.likelihood.steps import LEAST_CURVATURE
@@ -50,7 +49,7 @@ class Level(NamedTuple):
 
 
 class NoiseProfile:
-    """A chosen model at every level of the noise of some states; what was computed is kept."""
+    """A chosen model at every level of the noise of one state; what was computed is kept."""
 
     def __init__(self, search: Search, assessor: Assessor, chosen: Trial) -> None:
         self.search, self.assessor, self.chosen = search, assessor, chosen
@@ -58,32 +57,23 @@ class NoiseProfile:
         self.inputs = Forces(plan.rule, plan.coordinates, plan.augmented.model.dt).inputs(
             chosen.optimum.z, plan.windows
         )
-        self._found: dict[tuple[int, ...], list[Level]] = {}
-        self._answers: dict[str, Any] = {}
+        self._found: dict[int, list[Level]] = {}
 
-    def once(self, question: str, work: Callable[[], Answer]) -> Answer:
-        """Return what work comes to, which is not done again for the same question."""
-        if question not in self._answers:
-            self._answers[question] = work()
-        answer: Answer = self._answers[question]
-        return answer
-
-    def __call__(self, *rows: int) -> list[Level]:
+    def __call__(self, row: int) -> list[Level]:
         """Return the levels at which the filter does not diverge.
 
         Args:
-            rows: of the driven states whose process noise is taken down, together.
+            row: of the driven state whose process noise is taken down.
         """
-        if rows not in self._found:
+        if row not in self._found:
             coordinates, z = self.search.plan.coordinates, self.chosen.optimum.z
-            places = [sum(coordinates.sizes[:2]) + coordinates.driven.index(row) for row in rows]
-            self._found[rows] = []
+            i = sum(coordinates.sizes[:2]) + coordinates.driven.index(row)
+            self._found[row] = []
             for level in LEVELS:
                 at = z.copy()
-                for i in places:
-                    at[i] = coordinates.unit(i, level * coordinates.value(i, float(z[i])))
-                self._found[rows] += self._at(at)
-        return self._found[rows]
+                at[i] = coordinates.unit(i, level * coordinates.value(i, float(z[i])))
+                self._found[row] += self._at(at)
+        return self._found[row]
 
     def _at(self, z: np.ndarray) -> list[Level]:
         windows = self.search.plan.windows
