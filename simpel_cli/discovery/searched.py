@@ -111,7 +111,9 @@ def _searched(ground: Ground, effects: list[Expression]) -> Searched:
             ground = ground._replace(options=options, earlier=found.earlier, finer=True)
         else:
             terminal.line(found.memory.words, "memory")
-            ground = ground._replace(remembering=found.memory.terms, earlier=found.earlier)
+            ground = ground._replace(
+                remembering=found.memory.terms, earlier=found.earlier, simulated=found.simulated or ground.simulated
+            )
             effects = found.effects or effects
         found = _search_in_groups(ground, effects)
     last = last_calibration(ground, declared, found.search, found.selection, found.assessor, per_of(found.groupings))
@@ -331,18 +333,19 @@ def _with(
             return outcome
         found, selection, gates = outcome
     search, windows = found.search, found.test
-    by_simulations = None
+    by_simulations, begun = None, None
     simulate = worth_simulating(search, assessor, selection, options)
     if simulate and not ground.budget.over("a search by simulations"):
         attach_simulated = partial(attach, saying(model, between_rows), kept=kept, simulated=True)
         simulated = simulating(search, selection.base, attach_simulated, fitter)
-        ahead = assessor.of(simulated.plan)
+        assessors = assessor, assessor.of(simulated.plan)
         by_simulations = chosen_by_simulations(
-            search, selection, simulated, ahead, options, terminal, wider, ground.simulated
+            search, selection, simulated, assessors, options, terminal, wider, ground.simulated
         )
         if isinstance(by_simulations, Wider):
             return by_simulations._replace(earlier=chosen_of(found, selection))
         if by_simulations is not None:
+            begun = Earlier(simulated, by_simulations[0].chosen)
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
@@ -356,6 +359,7 @@ def _with(
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
         again = asked_again(chosen_of(found, selection), *promising, attach_said, options, terminal)
+        again = again and again._replace(simulated=begun)
         if again is not None and not model.groups:
             return again
     # nor may a drift

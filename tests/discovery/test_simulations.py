@@ -8,11 +8,26 @@ import numpy as np
 import pytest
 from test_ranges import DRAG, cart, measured, searched
 
+import simpel_cli.discovery.searched as whole
+from simpel_cli.discovery.ground import Ground
+from simpel_cli.discovery.search.again import Again, Earlier
+from simpel_cli.discovery.search.budget import Budget
 from simpel_cli.discovery.search.sets.forward import select
+from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.simulations import chosen_by_simulations, in_rows, simulating, worth_simulating
+from simpel_cli.discovery.search.simulations import (
+    Spoiling,
+    chosen_by_simulations,
+    in_rows,
+    simulating,
+    spoiling,
+    worth_simulating,
+)
 from simpel_cli.discovery.search.smaller import carried, names_of
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained.memories import Memory
+from simpel_cli.discovery.searched import Searched
+from simpel_cli.discovery.watch import Watch
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import Setup, setup
@@ -80,13 +95,14 @@ def test_it_is_said_in_the_coordinates_of_the_ordinary_search(both: tuple[Any, .
 
 def test_what_simulations_ask_for_is_chosen_where_it_is_worth_more() -> None:
     search, simulated = searches()
-    assessor, terminal = Assessor(simulated.plan, 10), Terminal(quiet=True)
+    assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
+    terminal = Terminal(quiet=True)
     found = select(search)
     assert [search.terms[t].effect for t in found.chosen.terms] == ["drag"]
     options = Discovery(beginnings=0)
-    assert chosen_by_simulations(search, found, simulated, assessor, options, terminal) is None  # they say the same
+    assert chosen_by_simulations(search, found, simulated, assessors, options, terminal) is None  # they say the same
     nothing = found._replace(chosen=found.base, path=(found.base,), classes=(), gains=())
-    other = chosen_by_simulations(search, nothing, simulated, assessor, options, terminal)
+    other = chosen_by_simulations(search, nothing, simulated, assessors, options, terminal)
     assert other is not None
     assert [simulated.terms[t].effect for t in other[0].chosen.terms] == ["drag"]
     assert all(g.passed for g in other[1])
@@ -150,3 +166,60 @@ def test_a_model_that_runs_away_asks_for_simulations() -> None:
     model.groups = {}
     errors[1.0] = 1e-3 * free
     assert not unwrap(worth_simulating)(search, assessor, selection, free_run)
+
+
+def test_an_effect_that_makes_the_filter_worse_is_not_accepted(
+    both: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Simulations may ask for it: what they leave has a memory, which follows whatever is left."""
+    search, simulated, selection, _ = both
+    assessor, (drag,) = Assessor(search.plan, 10), selection.chosen.terms
+    assert spoiling(simulated, search, assessor, selection.chosen) is None
+    # as if the simulator by itself were the model with the effect: one row ahead it is off by many times the noise
+    swapped = selection.chosen._replace(optimum=selection.base.optimum)
+    monkeypatch.setattr(simulated, "part", lambda *_: selection.chosen._replace(terms=()))
+    found = spoiling(simulated, search, assessor, swapped)
+    assert found is not None
+    assert found.term == drag
+    assert found.error.endswith(("one row ahead", "some rows ahead"))
+    assert found.times > 1.1
+
+
+def test_the_search_goes_on_without_what_makes_the_filter_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, simulated = searches()
+    base = search.base()
+    nothing = Selection(base, base, (base,), (), (), (), None)
+    asked: list[tuple[int, ...]] = []
+
+    def spoiled(*args: Any) -> Spoiling | None:
+        asked.append(args[-1].terms)
+        return Spoiling(args[-1].terms[0], "s one row ahead", 2.0) if args[-1].terms else None
+
+    monkeypatch.setattr("simpel_cli.discovery.search.simulations.spoiling", spoiled)
+    assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
+    options, terminal = Discovery(beginnings=0), Terminal(quiet=True)
+    assert chosen_by_simulations(search, nothing, simulated, assessors, options, terminal) is None
+    assert len(asked[0]) == 1
+    assert asked[-1] == ()
+    assert simulated.banned >= set(asked[0])
+
+
+def test_a_search_with_a_hidden_state_begins_with_what_simulations_have_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own search by simulations is another one, and may end elsewhere."""
+    nothing: Any = None
+    search: Any = searched(measured(B))
+    known = Earlier(search, Trial((), nothing))
+    grounds = list[Ground]()
+
+    def search_in_groups(ground: Ground, _: Any) -> Any:
+        grounds.append(ground)
+        if len(grounds) < 3:
+            return Again(Memory((), 20.0), None, simulated=known if len(grounds) == 1 else None)
+        return Searched(search, nothing, nothing, [], None, nothing, nothing, {}, {}, [])
+
+    monkeypatch.setattr(whole, "_search_in_groups", search_in_groups)
+    monkeypatch.setattr(whole, "last_calibration", lambda *_: SimpleNamespace(_asdict=dict))
+    model, clean, terminal = search.plan.augmented.model, SimpleNamespace(recording=nothing), Terminal(quiet=True)
+    ground: Any = Ground(model, clean, nothing, (), terminal, Budget(), Watch(Budget()))  # type: ignore[arg-type]
+    unwrap(whole._searched)(ground, [])
+    assert [g.simulated for g in grounds] == [None, known, known]

@@ -110,11 +110,13 @@ class Again(NamedTuple):
         memory: they.
         earlier: what was chosen, beside which they promise; None: they do in its place.
         effects: with those that differ from group to group; None: as they were given.
+        simulated: what a search by simulations has chosen without them.
     """
 
     memory: Memory
     earlier: Earlier | None
     effects: list[Expression] | None = None
+    simulated: Earlier | None = None
 
 
 def asked_again(

@@ -3,16 +3,19 @@
 One row ahead a wrong model may do as well as the right one, if noise of the process makes up for it; where the states are not
 all measured, it may do better. So a model that will be used for simulations is searched for by those, with the same effects,
 evidence and gates. What was found is then said in the coordinates of the ordinary search, in which the noise alone is fitted
-once more: residuals, errors ahead and what is left are looked at there.
+once more: residuals, errors ahead and what is left are looked at there. What simulations leave has a memory, which follows a
+wrong sensor as well as a right one; so an effect that makes predictions of the ordinary filter worse there is not accepted.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
 from simpel_cli.discovery.search.again import Earlier, path_in
-from simpel_cli.discovery.search.gate.held_out import Gate
+from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, growing
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
@@ -20,7 +23,8 @@ from simpel_cli.discovery.search.share import shares
 from simpel_cli.discovery.search.smaller import carried, carried_windows, names_of
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
 from simpel_cli.discovery.search.uses import FREE_RUN
-from simpel_cli.filtering.errors_ahead import Assessor, rmse, with_lost
+from simpel_cli.filtering.errors_ahead import Assessment, Assessor, rmse, with_lost
+from simpel_cli.filtering.independent_parts import independent_parts
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
@@ -75,8 +79,8 @@ def _begun(old: Setup, z: np.ndarray, plan: Setup) -> np.ndarray:
 
 
 def chosen_by_simulations(
-    found: Search, selection: Selection, simulated: Search, assessor: Assessor, options: Discovery, terminal: Terminal,
-    wider: Callable[[Search, Trial], Wider | None] = lambda *_: None, earlier: Earlier | None = None,
+    found: Search, selection: Selection, simulated: Search, assessors: tuple[Assessor, Assessor], options: Discovery,
+    terminal: Terminal, wider: Callable[[Search, Trial], Wider | None] = lambda *_: None, earlier: Earlier | None = None,
 ) -> tuple[Selection, list[Gate]] | Wider | None:  # fmt: skip
     """Return other effects that simulations ask for, with their gates; None: they ask for none that are worth more.
 
@@ -86,13 +90,14 @@ def chosen_by_simulations(
         found: the ordinary search.
         selection: what it has chosen: the search by simulations begins with that, too.
         simulated: the search by simulations.
-        assessor: of its program.
+        assessors: of the ordinary program, and of its own.
         options: of the search.
         terminal: takes lines.
         wider: whether ranges are too narrow for a model.
         earlier: what a search by simulations has chosen in narrower ranges: this one may begin with that instead.
     """
     terminal.line("by simulations, whose remainders have a memory", "search")
+    in_filter, assessor = assessors
     path = [simulated.base()]
     for trial in selection.path[1:]:
         start = Hypothesis(
@@ -107,19 +112,82 @@ def chosen_by_simulations(
         ends = wider(simulated, at.chosen)
         return ends and ends._replace(simulated=Earlier(simulated, at.chosen))
 
-    other = proposed(simulated, assessor, path[0], options, begun)
-    outcome = judgement(simulated, assessor, other, terminal, ask=ask)
-    if isinstance(outcome, Wider):
-        return outcome
-    judged, gates = outcome
-    other, gates = accepted(simulated, assessor, judged, gates, terminal)
-    if other.chosen.terms != judged.chosen.terms and (ends := ask(other, True)) is not None:
-        return ends
+    def spoils(chosen: Trial) -> bool:
+        found_ = spoiling(simulated, found, in_filter, chosen)
+        if found_ is not None:
+            simulated.banned.add(found_.term)
+            label = simulated.terms[found_.term].label
+            terminal.line(f"{label}: the error of {found_.error} grows {found_.times:.3g} times: not accepted", "gate")
+        return found_ is not None
+
+    while True:
+        allowed = [not simulated.banned.intersection(t.terms) for t in begun]
+        begun = begun[: (*allowed, False).index(False)]
+        other = proposed(simulated, assessor, path[0], options, begun)
+        if spoils(other.chosen):
+            continue  # from the beginning: what was found beside it may have been for its sake
+        outcome = judgement(simulated, assessor, other, terminal, ask=ask)
+        if isinstance(outcome, Wider):
+            return outcome
+        judged, gates = outcome
+        other, gates = accepted(simulated, assessor, judged, gates, terminal)
+        if other.chosen.terms != judged.chosen.terms and (ends := ask(other, True)) is not None:
+            return ends
+        if not spoils(other.chosen):
+            break
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")
         return None
     return other, gates
+
+
+class Spoiling(NamedTuple):
+    """An effect that makes predictions of the ordinary filter worse.
+
+    Args:
+        term: which of the search's.
+        error: that grows most, in words.
+        times: how often it is as large as without the effect.
+    """
+
+    term: int
+    error: str
+    times: float
+
+
+def spoiling(simulated: Search, search: Search, assessor: Assessor, chosen: Trial) -> Spoiling | None:
+    """Return the effect with which an error of the ordinary filter, in the rows of its search, surely grows most.
+
+    With and without it parameters are those that simulations give, and noise is fitted to these rows.
+
+    Args:
+        simulated: the search by simulations.
+        search: the ordinary one.
+        assessor: of its program.
+        chosen: a model of the search by simulations.
+    """
+    windows, names = search.plan.windows, search.plan.augmented.measured
+
+    def assessed(trial: Trial) -> Assessment:
+        (noisy,) = _noisy(search, [_moved(simulated, trial, search)])
+        return assessor(noisy.z, windows)
+
+    def asked(trial: Trial) -> Assessment:
+        return simulated.once(("in the filter", trial.terms, trial.optimum.z.tobytes()), partial(assessed, trial))
+
+    found: list[Spoiling] = []
+    for gone in chosen.terms:
+        part = simulated.part(chosen, tuple(t for t in chosen.terms if t != gone))
+        for name in ("one_step", "ahead"):  # free runs are what simulations judge
+            without, with_it = (getattr(asked(trial), name) for trial in (part, chosen))
+            cut, words = independent_parts(without, with_it, windows.episode), AHEAD[name]
+            which = growing({words: cut.before}, {words: cut.after}, names, cut.parts)
+            for j, channel in enumerate(names):
+                if f"{channel} {words}" in which:
+                    before, after = (rmse(e) for e in with_lost(without[..., [j]], with_it[..., [j]]))
+                    found.append(Spoiling(gone, f"{channel} {words}", float(after[0] / before[0])))
+    return max(found, key=lambda spoils: spoils.times, default=None)
 
 
 def in_rows(simulated: Search, selection: Selection, search: Search) -> Selection:
@@ -131,9 +199,9 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
     rivals = (t for rivals in selection.classes for t in rivals)
     sets = {frozenset(t.terms): t for t in (*rivals, selection.base, selection.chosen, *selection.path)}
     moved = [_moved(simulated, t, search) for t in sets.values()]
-    noise = search.fitter([Hypothesis(t.optimum.z, search.noise, search.ones) for t in moved])
     here = search.fitter(
-        [Hypothesis(o.z, search.free(t.terms), search.ones) for t, o in zip(moved, noise, strict=True)], 1
+        [Hypothesis(o.z, search.free(t.terms), search.ones) for t, o in zip(moved, _noisy(search, moved), strict=True)],
+        1,
     )
     search.forget()
     search.banned = simulated.banned
@@ -153,6 +221,11 @@ def in_rows(simulated: Search, selection: Selection, search: Search) -> Selectio
             for s in selection.stages
         ),
     )
+
+
+def _noisy(search: Search, moved: Sequence[Trial]) -> list[Optimum]:
+    """Return models with the parameters of simulations and levels of noise that suit the rows of the ordinary search."""
+    return search.fitter([Hypothesis(t.optimum.z, search.noise, search.ones) for t in moved])
 
 
 def _moved(simulated: Search, trial: Trial, search: Search) -> Trial:
