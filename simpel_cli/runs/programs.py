@@ -13,7 +13,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,14 @@ import numpy as np
 from jax import export
 
 import simpel_cli
+from simpel_cli.runs.resident import Resident, resident_mib
 from simpel_cli.runs.settings import current_device
 
 SUFFIX = ".program"
 # of large programs of small loops: on a CPU as fast as with what XLA does else, and compiled in about half the time
 QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _KNOWING = threading.Lock()
+_IN_MEMORY = Resident()
 MOST_KEPT = 200  # files; those that were not used for longest go first
 
 
@@ -56,11 +58,23 @@ class Program:
         if (found := self._by_shape.get(shape)) is None:
             with self._lock:  # threads of a batch need one program, once
                 if (found := self._by_shape.get(shape)) is None:
+                    before = resident_mib()
                     found = self._found(arguments, shape)
                     found(*arguments)
                     self._by_shape[shape] = found
                     _returned()
+                    if _folder() is not None:  # without one it would be compiled once more
+                        size = resident_mib() - before
+                        if _IN_MEMORY.add((id(self), shape), size, partial(self._forget, shape)):
+                            _returned()
+        _IN_MEMORY.used((id(self), shape))
         return found(*arguments)
+
+    def _forget(self, shape: Any) -> None:
+        """Let go of what was compiled for arguments of a shape; a thread that is in it stays in it."""
+        found: Any = self._by_shape.pop(shape, None)
+        if found is not None:
+            found.clear_cache()
 
     def _found(self, arguments: Any, shape: Any) -> Callable[..., Any]:
         folder = _folder()
