@@ -47,7 +47,12 @@ def independent_parts(before: np.ndarray, after: np.ndarray, episode: np.ndarray
     windows, rows, ny = before.shape
     if len(np.unique(episode)) >= LEAST_EPISODES:
         own = np.unique(episode, return_inverse=True)[1]
-        return Parts(before, after, np.repeat(own[:, None], ny, axis=1))
+        parts = np.repeat(own[:, None], ny, axis=1)
+        for j in range(ny):  # a sensor that speaks in one of many episodes has one ratio, and no interval
+            known = np.isfinite([before[..., j], after[..., j]]).any(axis=(0, 2))
+            if len(np.unique(own[known])) < LEAST_EPISODES:
+                parts[:, j] = NO_PART
+        return Parts(before, after, parts)
     there = np.asarray(np.isfinite([before, after]).any(axis=(0, 1, 3)))  # none has an error before its horizon
     if there.any():
         begin, end = int(np.argmax(there)), rows - int(np.argmax(there[::-1]))

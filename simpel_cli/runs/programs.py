@@ -13,7 +13,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -58,23 +58,28 @@ class Program:
         if (found := self._by_shape.get(shape)) is None:
             with self._lock:  # threads of a batch need one program, once
                 if (found := self._by_shape.get(shape)) is None:
-                    before = resident_mib()
-                    found = self._found(arguments, shape)
-                    found(*arguments)
-                    self._by_shape[shape] = found
-                    _returned()
-                    if _folder() is not None:  # without one it would be compiled once more
-                        size = resident_mib() - before
-                        if _IN_MEMORY.add((id(self), shape), size, partial(self._forget, shape)):
-                            _returned()
+                    return self._made(arguments, shape)
         _IN_MEMORY.used((id(self), shape))
         return found(*arguments)
 
-    def _forget(self, shape: Any) -> None:
+    def _made(self, arguments: Any, shape: Any) -> Any:
+        """Make the program for arguments of a shape, and return what it comes to."""
+        # without a cache it would be compiled once more; of a device's programs the process does not tell the size
+        measured = _folder() is not None and current_device().platform == "cpu"
+        if measured:
+            _returned()
+        before = resident_mib()
+        found = self._found(arguments, shape)
+        result = found(*arguments)
+        self._by_shape[shape] = found
+        _returned()
+        if measured and _IN_MEMORY.add((id(self), shape), resident_mib() - before, self._forget):
+            _returned()
+        return result
+
+    def _forget(self, name: Any) -> None:
         """Let go of what was compiled for arguments of a shape; a thread that is in it stays in it."""
-        found: Any = self._by_shape.pop(shape, None)
-        if found is not None:
-            found.clear_cache()
+        self._by_shape.pop(name[1], None)
 
     def _found(self, arguments: Any, shape: Any) -> Callable[..., Any]:
         folder = _folder()

@@ -12,6 +12,7 @@ import simpel_cli.discovery.searched as whole
 from simpel_cli.discovery.ground import Ground
 from simpel_cli.discovery.search.again import Again, Earlier
 from simpel_cli.discovery.search.budget import Budget
+from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.settings import Discovery
@@ -185,23 +186,97 @@ def test_an_effect_that_makes_the_filter_worse_is_not_accepted(
     assert found.times > 1.1
 
 
+def nothing_of(search: Search) -> Selection:
+    """What an ordinary search has chosen that found nothing."""
+    base = search.base()
+    return Selection(base, base, (base,), (), (), (), None)
+
+
+MODULE = "simpel_cli.discovery.search.simulations"
+
+
 def test_the_search_goes_on_without_what_makes_the_filter_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     search, simulated = searches()
-    base = search.base()
-    nothing = Selection(base, base, (base,), (), (), (), None)
     asked: list[tuple[int, ...]] = []
 
     def spoiled(*args: Any) -> Spoiling | None:
         asked.append(args[-1].terms)
         return Spoiling(args[-1].terms[0], "s one row ahead", 2.0) if args[-1].terms else None
 
-    monkeypatch.setattr("simpel_cli.discovery.search.simulations.spoiling", spoiled)
+    monkeypatch.setattr(f"{MODULE}.spoiling", spoiled)
     assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
     options, terminal = Discovery(beginnings=0), Terminal(quiet=True)
-    assert chosen_by_simulations(search, nothing, simulated, assessors, options, terminal) is None
+    assert chosen_by_simulations(search, nothing_of(search), simulated, assessors, options, terminal) is None
     assert len(asked[0]) == 1
     assert asked[-1] == ()
     assert simulated.banned >= set(asked[0])
+
+
+def test_what_spoils_after_it_was_judged_goes_too_and_bans_beside_it_do_not_stay(
+    both: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beginnings are cut where the effect comes in; an earlier one without it is a beginning still."""
+    search, _, selection, _ = both
+    _, simulated = searches()
+    base = simulated.base()
+    spoiler, refused, good = 0, 7, 5
+    known = (base, base._replace(terms=(good,)))
+    begun: list[tuple[tuple[int, ...], ...]] = []
+    banned: list[set[int]] = []
+
+    def proposal(_: Any, __: Any, ___: Any, ____: Any, path: Any) -> Any:
+        begun.append(tuple(t.terms for t in path))
+        banned.append(set(simulated.banned))
+        terms = (spoiler,) if spoiler not in simulated.banned else (good,)
+        return selection._replace(base=base, chosen=base._replace(terms=terms), path=(base, base._replace(terms=terms)))
+
+    checked: list[tuple[int, ...]] = []
+
+    def spoiled(*args: Any) -> Spoiling | None:
+        checked.append(args[-1].terms)
+        late = spoiler in args[-1].terms and checked.count((spoiler,)) == 2
+        return Spoiling(spoiler, "s one row ahead", 2.0) if late else None
+
+    def accepted(_: Any, __: Any, judged: Any, gates: Any, ___: Any) -> Any:
+        simulated.banned = {*simulated.banned, *([refused] if spoiler in judged.chosen.terms else [])}
+        return judged, gates
+
+    monkeypatch.setattr(f"{MODULE}.proposed", proposal)
+    monkeypatch.setattr(f"{MODULE}.judgement", lambda _, __, other, ___, ask: (other, []))
+    monkeypatch.setattr(f"{MODULE}.accepted", accepted)
+    monkeypatch.setattr(f"{MODULE}.spoiling", spoiled)
+    monkeypatch.setattr(f"{MODULE}.path_in", lambda *_: known)
+    monkeypatch.setattr(f"{MODULE}.worth", lambda t: {(): 0.0, (spoiler,): 9.0, (good,): 8.0}[t.terms])
+    monkeypatch.setattr(simulated, "best", lambda terms, _: base._replace(terms=terms))
+    assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
+    outcome = chosen_by_simulations(
+        search, selection._replace(path=(selection.base, selection.chosen)), simulated, assessors,
+        Discovery(), Terminal(quiet=True), earlier=Earlier(simulated, base),
+    )  # fmt: skip
+    assert selection.chosen.terms == (spoiler,)  # what the ordinary search has chosen
+    assert begun == [((), (spoiler,)), ((), (good,))]
+    assert banned == [set(), {spoiler}]
+    assert outcome is None or outcome[0].chosen.terms == (good,)  # type: ignore[union-attr]
+
+
+def test_no_wider_range_is_asked_for_by_what_makes_the_filter_worse(
+    both: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search, _, selection, _ = both
+    _, simulated = searches()
+    assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
+    checked: list[tuple[int, ...]] = []
+
+    def spoiled(*args: Any) -> Spoiling | None:
+        checked.append(args[-1].terms)  # the first time it is looked at, it is what was proposed
+        return Spoiling(args[-1].terms[0], "s one row ahead", 2.0) if args[-1].terms and len(checked) > 1 else None
+
+    monkeypatch.setattr(f"{MODULE}.spoiling", spoiled)
+    outcome = chosen_by_simulations(
+        search, selection, simulated, assessors, Discovery(beginnings=0), Terminal(quiet=True),
+        lambda _, trial: Wider({"b": (0.0, 9.0)}, 9.0) if trial.terms else None,
+    )  # fmt: skip
+    assert outcome is None
 
 
 def test_a_search_with_a_hidden_state_begins_with_what_simulations_have_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

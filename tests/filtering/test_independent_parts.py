@@ -95,3 +95,14 @@ def test_a_swing_that_began_wrong_is_one_error() -> None:
         low, high = reduction_interval(cut.before, cut.after, cut.parts, random)[:, 0]
         wrong.append(low > 1 or high < 1)
     assert np.mean(wrong) < 0.05
+
+
+def test_a_channel_of_one_episode_in_many_has_no_interval() -> None:
+    """Every resample of episodes would have the same ratio: a point, however few values there are."""
+    random = np.random.default_rng(0)
+    before, after = random.normal(size=(2, 10, 40, 2))
+    before[1:, :, 1], after[1:, :, 1] = np.nan, np.nan
+    cut = independent_parts(before, after, np.arange(10))
+    interval = reduction_interval(cut.before, cut.after, cut.parts, np.random.default_rng(1))
+    assert np.isfinite(interval[:, 0]).all()
+    assert np.isnan(interval[:, 1]).all()

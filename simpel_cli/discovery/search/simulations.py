@@ -24,7 +24,7 @@ from simpel_cli.discovery.search.smaller import carried, carried_windows, names_
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
 from simpel_cli.discovery.search.uses import FREE_RUN
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, rmse, with_lost
-from simpel_cli.filtering.independent_parts import independent_parts
+from simpel_cli.filtering.independent_parts import Parts, independent_parts
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
@@ -104,42 +104,48 @@ def chosen_by_simulations(
             _begun(found.plan, trial.optimum.z, simulated.plan), simulated.free(trial.terms), simulated.ones
         )
         path.append(simulated.best(trial.terms, simulated.fitter([start])))
-    own, begun = path[-1], tuple(path)
-    known = path_in(simulated, path[0], earlier) if earlier is not None else ()
-    begun = max(begun, known or begun, key=lambda p: worth(p[-1]))
+    own, begun = path[-1], [tuple(path)]
+    if earlier is not None and (known := path_in(simulated, path[0], earlier)):
+        begun.append(known)
 
     def ask(at: Selection, _: bool) -> Wider | None:
         ends = wider(simulated, at.chosen)
-        return ends and ends._replace(simulated=Earlier(simulated, at.chosen))
-
-    def spoils(chosen: Trial) -> bool:
-        found_ = spoiling(simulated, found, in_filter, chosen)
-        if found_ is not None:
-            simulated.banned.add(found_.term)
-            label = simulated.terms[found_.term].label
-            terminal.line(f"{label}: the error of {found_.error} grows {found_.times:.3g} times: not accepted", "gate")
-        return found_ is not None
+        if ends is None or spoiling(simulated, found, in_filter, at.chosen) is not None:
+            return None
+        return ends._replace(simulated=Earlier(simulated, at.chosen))
 
     while True:
-        allowed = [not simulated.banned.intersection(t.terms) for t in begun]
-        begun = begun[: (*allowed, False).index(False)]
-        other = proposed(simulated, assessor, path[0], options, begun)
-        if spoils(other.chosen):
-            continue  # from the beginning: what was found beside it may have been for its sake
-        outcome = judgement(simulated, assessor, other, terminal, ask=ask)
-        if isinstance(outcome, Wider):
-            return outcome
-        judged, gates = outcome
-        other, gates = accepted(simulated, assessor, judged, gates, terminal)
-        if other.chosen.terms != judged.chosen.terms and (ends := ask(other, True)) is not None:
-            return ends
-        if not spoils(other.chosen):
+        banned = frozenset(simulated.banned)
+        allowed = (_cut(paths, banned) for paths in begun)
+        other = proposed(simulated, assessor, path[0], options, max(allowed, key=lambda p: worth(p[-1])))
+        spoils = spoiling(simulated, found, in_filter, other.chosen)
+        if spoils is None:
+            outcome = judgement(simulated, assessor, other, terminal, ask=ask)
+            if isinstance(outcome, Wider):
+                return outcome
+            judged, gates = outcome
+            other, gates = accepted(simulated, assessor, judged, gates, terminal)
+            spoils = spoiling(simulated, found, in_filter, other.chosen)
+            if spoils is None and other.chosen.terms != judged.chosen.terms and (ends := ask(other, True)) is not None:
+                return ends
+        if spoils is None:
             break
+        # from the beginning: what was found beside it, or refused, may have been so for its sake
+        simulated.banned = {*banned, spoils.term}
+        label = simulated.terms[spoils.term].label
+        terminal.line(f"{label}: the error of {spoils.error} grows {spoils.times:.3g} times: not accepted", "gate")
+        if simulated.budget.over("simulations without what makes the filter worse"):
+            return None
     better = worth(other.chosen) > worth(own) + ACCEPT and set(other.chosen.terms) != set(own.terms)
     if not other.chosen.terms or not better:
         terminal.line("they ask for nothing else", "search")
         return None
     return other, gates
+
+
+def _cut(path: tuple[Trial, ...], banned: frozenset[int]) -> tuple[Trial, ...]:
+    """Return a path as far as it has no banned effect; the simulator alone is always there."""
+    return tuple(trial for trial in path if not banned.intersection(trial.terms))
 
 
 class Spoiling(NamedTuple):
@@ -179,14 +185,16 @@ def spoiling(simulated: Search, search: Search, assessor: Assessor, chosen: Tria
     found: list[Spoiling] = []
     for gone in chosen.terms:
         part = simulated.part(chosen, tuple(t for t in chosen.terms if t != gone))
-        for name in ("one_step", "ahead"):  # free runs are what simulations judge
-            without, with_it = (getattr(asked(trial), name) for trial in (part, chosen))
-            cut, words = independent_parts(without, with_it, windows.episode), AHEAD[name]
-            which = growing({words: cut.before}, {words: cut.after}, names, cut.parts)
+        without, with_it = asked(part), asked(chosen)
+        ahead = {AHEAD[name]: (getattr(without, name), getattr(with_it, name)) for name in ("one_step", "ahead")}
+        cut = {words: independent_parts(*both, windows.episode) for words, both in ahead.items()}
+        before, after, parts = ({words: getattr(c, of) for words, c in cut.items()} for of in Parts._fields)
+        which = growing(before, after, names, parts)  # free runs are what simulations judge
+        for words, both in ahead.items():
             for j, channel in enumerate(names):
-                if f"{channel} {words}" in which:
-                    before, after = (rmse(e) for e in with_lost(without[..., [j]], with_it[..., [j]]))
-                    found.append(Spoiling(gone, f"{channel} {words}", float(after[0] / before[0])))
+                if (error := f"{channel} {words}") in which:
+                    small, large = (rmse(e[..., [j]]) for e in with_lost(*both))
+                    found.append(Spoiling(gone, error, float(large[0] / small[0])))
     return max(found, key=lambda spoils: spoils.times, default=None)
 
 
