@@ -11,6 +11,7 @@ import pytest
 from command_line import KEPT, ROOT
 
 import simpel_cli  # noqa: F401  sets XLA's flags before JAX opens its backend
+from simpel_cli.runs.resident import resident_mib
 
 LONGEST = (
     "sweep", "discover", "online", "methods", "control", "resume", "wrong_inputs", "cli", "pathwise", "fsvgd_posterior",
@@ -71,8 +72,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _programs() -> Iterator[None]:
     """Compiled programs take gigabytes in the end: let go of them when there are too many."""
     yield
-    pages = Path("/proc/self/statm")
-    if not pages.exists() or int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_BYTES:
+    mib = resident_mib()
+    if mib == 0 or mib * 2**20 > MOST_BYTES:
         jax.clear_caches()
 
 

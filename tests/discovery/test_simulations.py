@@ -219,7 +219,7 @@ def test_what_spoils_after_it_was_judged_goes_too_and_bans_beside_it_do_not_stay
     search, _, selection, _ = both
     _, simulated = searches()
     base = simulated.base()
-    spoiler, refused, good = 0, 7, 5
+    spoiler, refused, good, more = 0, 7, 5, 6
     known = (base, base._replace(terms=(good,)))
     begun: list[tuple[tuple[int, ...], ...]] = []
     banned: list[set[int]] = []
@@ -227,7 +227,7 @@ def test_what_spoils_after_it_was_judged_goes_too_and_bans_beside_it_do_not_stay
     def proposal(_: Any, __: Any, ___: Any, ____: Any, path: Any) -> Any:
         begun.append(tuple(t.terms for t in path))
         banned.append(set(simulated.banned))
-        terms = (spoiler,) if spoiler not in simulated.banned else (good,)
+        terms = (spoiler,) if spoiler not in simulated.banned else (good, more)
         return selection._replace(base=base, chosen=base._replace(terms=terms), path=(base, base._replace(terms=terms)))
 
     checked: list[tuple[int, ...]] = []
@@ -246,7 +246,9 @@ def test_what_spoils_after_it_was_judged_goes_too_and_bans_beside_it_do_not_stay
     monkeypatch.setattr(f"{MODULE}.accepted", accepted)
     monkeypatch.setattr(f"{MODULE}.spoiling", spoiled)
     monkeypatch.setattr(f"{MODULE}.path_in", lambda *_: known)
-    monkeypatch.setattr(f"{MODULE}.worth", lambda t: {(): 0.0, (spoiler,): 9.0, (good,): 8.0}[t.terms])
+    monkeypatch.setattr(
+        f"{MODULE}.worth", lambda t: {(): 0.0, (spoiler,): 9.0, (good,): 8.0, (good, more): 20.0}[t.terms]
+    )
     monkeypatch.setattr(simulated, "best", lambda terms, _: base._replace(terms=terms))
     assessors = Assessor(search.plan, 10), Assessor(simulated.plan, 10)
     outcome = chosen_by_simulations(
@@ -256,7 +258,9 @@ def test_what_spoils_after_it_was_judged_goes_too_and_bans_beside_it_do_not_stay
     assert selection.chosen.terms == (spoiler,)  # what the ordinary search has chosen
     assert begun == [((), (spoiler,)), ((), (good,))]
     assert banned == [set(), {spoiler}]
-    assert outcome is None or outcome[0].chosen.terms == (good,)  # type: ignore[union-attr]
+    assert isinstance(outcome, tuple)
+    assert not isinstance(outcome, Wider)
+    assert outcome[0].chosen.terms == (good, more)
 
 
 def test_no_wider_range_is_asked_for_by_what_makes_the_filter_worse(

@@ -15,7 +15,8 @@ import numpy as np
 
 from simpel_cli.discovery.search.acceptance import accepted, judgement, proposed
 from simpel_cli.discovery.search.again import Earlier, path_in
-from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate, growing
+from simpel_cli.discovery.search.gate.growth import growth
+from simpel_cli.discovery.search.gate.held_out import AHEAD, Gate
 from simpel_cli.discovery.search.ranges import Wider
 from simpel_cli.discovery.search.sets.selection import Selection, worth
 from simpel_cli.discovery.search.settings import Discovery
@@ -24,7 +25,6 @@ from simpel_cli.discovery.search.smaller import carried, carried_windows, names_
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage, Trial
 from simpel_cli.discovery.search.uses import FREE_RUN
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, rmse, with_lost
-from simpel_cli.filtering.independent_parts import Parts, independent_parts
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis, Optimum
 from simpel_cli.filtering.setup import Setup
 from simpel_cli.runs.console import Terminal
@@ -186,15 +186,10 @@ def spoiling(simulated: Search, search: Search, assessor: Assessor, chosen: Tria
     for gone in chosen.terms:
         part = simulated.part(chosen, tuple(t for t in chosen.terms if t != gone))
         without, with_it = asked(part), asked(chosen)
-        ahead = {AHEAD[name]: (getattr(without, name), getattr(with_it, name)) for name in ("one_step", "ahead")}
-        cut = {words: independent_parts(*both, windows.episode) for words, both in ahead.items()}
-        before, after, parts = ({words: getattr(c, of) for words, c in cut.items()} for of in Parts._fields)
-        which = growing(before, after, names, parts)  # free runs are what simulations judge
-        for words, both in ahead.items():
-            for j, channel in enumerate(names):
-                if (error := f"{channel} {words}") in which:
-                    small, large = (rmse(e[..., [j]]) for e in with_lost(*both))
-                    found.append(Spoiling(gone, error, float(large[0] / small[0])))
+        # free runs are what simulations judge
+        before, after = ({AHEAD[name]: getattr(e, name) for name in ("one_step", "ahead")} for e in (without, with_it))
+        grown = growth(before, after, names, windows.episode)
+        found += [Spoiling(gone, f"{g.channel} {g.ahead}", g.times) for g in grown]
     return max(found, key=lambda spoils: spoils.times, default=None)
 
 

@@ -11,11 +11,11 @@ windows hold, it is not asked: of a position that is added up over minutes a fre
 from functools import partial
 from typing import NamedTuple
 
-from simpel_cli.discovery.search.gate.held_out import AHEAD, growing
+from simpel_cli.discovery.search.gate.growth import growth
+from simpel_cli.discovery.search.gate.held_out import AHEAD
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.uses import FREE_RUN, ONE_STEP, calibrated_for
-from simpel_cli.filtering.errors_ahead import Assessor, rmse, with_lost
-from simpel_cli.filtering.independent_parts import independent_parts
+from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.initial_states import begun
 from simpel_cli.filtering.measurements.windows import Windows
 from simpel_cli.filtering.tracks import Tracks
@@ -74,9 +74,5 @@ def _growing(assessor: Assessor, whole: Trial, part: Trial, windows: Windows) ->
     without, with_it = (
         assessor.free_runs(t.optimum.z[None], begun(tracks, t.optimum.z, windows, first))[0] for t in (part, whole)
     )
-    cut = independent_parts(without, with_it, windows.episode)
-    names = assessor.plan.augmented.measured
-    which = growing({free: cut.before}, {free: cut.after}, names, cut.parts)
-    before, after = (rmse(errors) for errors in with_lost(without, with_it))
-    times = {name: float(after[j] / before[j]) for j, name in enumerate(names) if f"{name} {free}" in which}
-    return max(times.items(), key=lambda item: item[1], default=None)
+    grown = growth({free: without}, {free: with_it}, assessor.plan.augmented.measured, windows.episode)
+    return max(((g.channel, g.times) for g in grown), key=lambda item: item[1], default=None)
