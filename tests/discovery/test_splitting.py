@@ -1,5 +1,6 @@
 """One effect that holds another, and the two that fit as well in its place."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from inspect import unwrap
 from types import SimpleNamespace
@@ -32,8 +33,19 @@ SPRING = Expression(
 )
 
 
+LEANING = Expression(
+    "leaning", acts_on="v", term="g*(1 - 0.02*s)",
+    parameters={"g": {"range": [-2, 2], "unit": "m/s^2", "starts": [0.2]}},
+)  # fmt: skip
+
+
 def rubbing(noise: float, width: float = 0.05) -> Recording:
     """Carts whose friction is 1.2 m/s^2 forwards and 0.4 backwards, beyond a speed of `width`, m/s; noise: in m and m/s."""
+    return driven(lambda _, v: -(1.2 if v > 0 else 0.4) * np.tanh(v / width), noise)
+
+
+def driven(rate: Callable[[float, float], float], noise: float) -> Recording:
+    """Carts with something more, (s, v) -> m/s^2; noise: in m and m/s."""
     random, fine = np.random.default_rng(4), 50
     episodes = []
     for e in range(4):
@@ -42,8 +54,7 @@ def rubbing(noise: float, width: float = 0.05) -> Recording:
         for now in u:
             rows.append((s, v))
             for _ in range(fine):
-                t = np.tanh(v / width)
-                s, v = s + 0.1 / fine * v, v + 0.1 / fine * (1.2 * now - (1.2 if t > 0 else 0.4) * t)
+                s, v = s + 0.1 / fine * v, v + 0.1 / fine * (1.2 * now + rate(s, v))
         noisy = np.array(rows) + noise * random.normal(size=(60, 2))
         episodes.append(Episode(str(e), np.arange(60) * 0.1, noisy, u[:, None], np.zeros((60, 0))))
     every = {"s": noise, "v": noise}
@@ -87,6 +98,19 @@ def test_a_rival_by_itself_is_no_half_of_a_pair(said: bool) -> None:
     assert names(two_in_place(search, chosen, 0)) == [["coulomb", "load"]]
 
 
+@pytest.mark.parametrize(("noise", "nearly"), [(0.5, True), (0.1, False)])
+def test_what_nearly_won_may_be_one_of_two_effects(noise: float, nearly: bool) -> None:
+    """A push and a weak spring look like one law of the position, until there is little noise."""
+    plan = setup(cart(), driven(lambda s, _: 0.8 - 0.024 * s, noise), (), [LEANING, LOAD, SPRING, COULOMB], 4)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15))
+    named = [t for t, term in enumerate(search.terms) if not term.depends_on]
+    leaning, load, *_ = search.add(search.base(), named).trials
+    assert [search.terms[t.terms[0]].effect for t in (leaning, load)] == ["leaning", "load"]
+    behind = leaning.optimum.log_evidence - load.optimum.log_evidence
+    assert (splitting.TIE < behind < splitting.NEAR) is nearly
+    assert names(two_in_place(search, leaning, 0)) == ([["load", "spring"]] if nearly else [])
+
+
 @pytest.mark.parametrize(
     ("pairs", "said"),
     [
@@ -94,7 +118,11 @@ def test_a_rival_by_itself_is_no_half_of_a_pair(said: bool) -> None:
         ([("coulomb_friction", "load")], " (which these data cannot tell from coulomb friction on v with load on v)"),
         (
             [("coulomb", "load"), ("coulomb", "offset")],
-            " (which these data cannot tell from coulomb on v with load on v, or from coulomb on v with offset on v)",
+            " (which these data cannot tell from coulomb on v with load or offset on v)",
+        ),
+        (
+            [("dead_zone", "load"), ("dead_zone", "drag"), ("dead_zone", "offset"), ("lag", "load")],
+            " (which these data cannot tell from dead zone on v with load, drag or offset on v, or from lag on v with load on v)",
         ),
     ],
 )

@@ -1,10 +1,14 @@
 """What makes a verdict ambiguous, how its class is told, and what a search looks at of a long record."""
 
+from inspect import unwrap
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import searches
 
 from simpel_cli.data.recording import Episode
-from simpel_cli.discovery.verdict.verdict import _distinct
+from simpel_cli.discovery.verdict.verdict import _distinct, sentence
 from simpel_cli.filtering.measurements.windows import Windows, thinned, windows_of
 
 
@@ -49,3 +53,16 @@ def test_a_long_record_is_thinned_evenly_and_windows_know_their_rows() -> None:
     assert len(few.episode) + len(rest.episode) == len(windows.episode) == len(every)
     assert thinned(windows, 1000) == (windows, None)
     assert len(thinned(cut([100, 40]), 1)[0].episode) == 2  # one of each episode
+
+
+def test_a_tie_says_which_two_effects_do_as_well() -> None:
+    found = searches.verdict("ambiguous")
+    load = {"name": "constant_load", "acts_on": "tau_1"}
+    found["effects"][0]["same_as_two"] = [[load, {"name": n, "acts_on": "u_1"}] for n in ("input_lag", "input_scale")]
+    found["share_explained"] = 0.98
+    before, after = (SimpleNamespace(ahead=np.full((1, 1, 1), error)) for error in (0.4, 0.04))
+    told = unwrap(sentence)(found, before, after, ("omega",))
+    assert told.startswith(
+        "Causes that fit these data equally well: coulomb friction or viscous friction, "
+        "or constant load on tau_1 with input lag or input scale on u_1. "
+    )

@@ -69,6 +69,7 @@ def _scored(truth: dict[str, Any], folder: Path) -> dict[str, Any]:
         "of_before": score.error_ratio(found, found, "before"), "covered": inside, "intervals": counted,
         "nuisances": "+".join(truth.get("nuisances", ())),
         "named": json.dumps(named(tuple(truth.get("nuisances", ())), SYSTEMS[truth["system"]], found)),
+        "shows": json.dumps(truth.get("shows", {})),
         "grown": ",".join(found["error"].get("grows", ())),
         "seconds": found["seconds"], "candidates": found["candidates_tried"], "summary": found["summary"],
     }  # fmt: skip

@@ -69,8 +69,6 @@ def _said_to_be(
     effect: Mapping[str, Any], planted: Sequence[Mapping[str, Any]], allowed: Collection[tuple[str, str]]
 ) -> bool:
     """Whether it is said of an effect that these data cannot tell it from the two that are there, one maybe a nuisance."""
-    if any(not m.get("same", True) for m in effect.get("class_members", ())):
-        return False
     same = [
         {(n, p["acts_on"]) for n in p["accept"]} | {tuple(t.split("@")) for t in p["twins"]} for p in planted
     ]  # fmt: skip

@@ -172,13 +172,21 @@ def _grown(t: pd.DataFrame) -> list[dict[str, str]]:
 
 
 def _told(t: pd.DataFrame) -> list[dict[str, str]]:
-    """Rows of the nuisances: of how many sets the tool says that they are there."""
-    said = [json.loads(text) for text in t.get("named", pd.Series(dtype=object)).dropna()]
+    """Rows of the nuisances: of how many sets the tool says that they are there; also of those in which one shows."""
+    if "named" not in t:
+        return []
+    asked = t[t.named.notna()]
+    said = [json.loads(text) for text in asked.named]
+    shows = [json.loads(text) for text in asked["shows"].fillna("{}")] if "shows" in asked else [{}] * len(said)
     rows = []
     for name in sorted({n for each in said for n in each}):
         answers = [each[name] for each in said if name in each]
         rows.append({"figure": f"nuisance named: {name}", "bar": ">= 80 %", "simpel": share(sum(answers), len(answers)),
                      "met": _met(sum(answers) / len(answers), TOLD_LEAST, 1.0)})  # fmt: skip
+        clear = [each[name] for each, worth in zip(said, shows, strict=True) if worth.get(name, 0.0) >= CLEAR]
+        if clear:
+            rows.append({"figure": f"- {name}, where it is worth >= 10 nats", "bar": "",
+                         "simpel": share(sum(clear), len(clear)), "met": ""})  # fmt: skip
     return rows
 
 

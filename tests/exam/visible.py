@@ -7,24 +7,27 @@ is taken out by least squares. The expected log-likelihood ratio of the true mod
 
 import numpy as np
 
+from tests.exam import nuisances
 from tests.exam.draw import Set
 from tests.exam.integrate import simulate
 from tests.exam.plants import SYSTEMS
-from tests.exam.record import ROWS, TRAIN, Record, plant
+from tests.exam.record import ROWS, TEST, TRAIN, Record, plant, random_of
 
 WINDOW = 15  # rows: short enough for first order
 STEP = 1e-4  # of a range or of a state's standard deviation
 
 
-def visible(drawn: Set, made: Record, only: int | None = None) -> float:
+def visible(drawn: Set, made: Record, only: int | None = None, *, moving: bool = False) -> float:
     """Return the nats that the planted terms are worth in the training episodes.
 
     Args:
-        drawn: a set with terms in rates and inputs only.
+        drawn: a set with terms in rates and inputs; what acts on a sensor, or late, is left out.
         made: its data.
         only: number of one planted term, where the others are in the model and their parameters free.
+        moving: what is asked is what the parameter is worth that is no constant, with every planted term in the model.
     """
-    beside = [] if only is None else [i for i in range(len(drawn.effects)) if i != only]
+    every = range(len(drawn.effects))
+    beside = [i for i in every if i != only] if moving or only is not None else []
     system = SYSTEMS[drawn.system]
     begins = np.arange(0, ROWS, WINDOW)
     start = made.true[:TRAIN, begins].reshape(-1, len(system.states))
@@ -32,13 +35,25 @@ def visible(drawn: Set, made: Record, only: int | None = None) -> float:
     commands = commands.reshape(len(start), WINDOW, -1)
     of_window = np.tile(begins * system.dt, TRAIN)
     columns = [system.states.index(name) for name in drawn.measured]
+    _, at = nuisances.parameters_of(
+        drawn.nuisances, random_of(drawn, 1), made.parameters, TRAIN + TEST, ROWS * system.dt
+    )
+
+    def true(t: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the parameters of every window, of which some are the same in an episode."""
+        known = {name: np.asarray(value, float) for name, value in at(t).items()}
+        return {n: np.repeat(v[:TRAIN], len(begins)) if v.shape == (TRAIN + TEST,) else v for n, v in known.items()}
 
     def run(
         x: np.ndarray, p: dict[str, float], *, lacking: bool, all_knobs: tuple[dict[str, float], ...] = made.knobs
     ) -> np.ndarray:
-        there = beside if lacking else range(len(drawn.effects))
-        rate = plant(system, p, tuple(drawn.effects[i] for i in there), tuple(all_knobs[i] for i in there))
-        states, _, _ = simulate(lambda s, u, t: rate(s, u, t + of_window), x, commands, system.dt)
+        there = beside if lacking else every
+        moves = true if moving and not lacking else None
+        rate = plant(system, p, tuple(drawn.effects[i] for i in there), tuple(all_knobs[i] for i in there), moves)
+        states, _, _ = simulate(
+            lambda s, u, t: rate(s, u, t + of_window), x, commands, system.dt,
+            linear=nuisances.LINEAR in drawn.nuisances,
+        )  # fmt: skip
         return states[..., columns] / made.noise[columns]
 
     without = run(start, made.parameters, lacking=True)

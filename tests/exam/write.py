@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from tests.exam.draw import OUTSIDE, Set
-from tests.exam.nuisances import DIFFERING
+from tests.exam.nuisances import DIFFERING, DRIFT
 from tests.exam.plants import SYSTEMS
 from tests.exam.record import TRAIN, Record, record, truth
 from tests.exam.visible import visible
@@ -52,5 +52,6 @@ def write(drawn: Set, folder: Path, truth_file: Path) -> None:
     known = truth(drawn, made)
     if drawn.kind == OUTSIDE:
         known["visible"] = visible(drawn, made)
+    known["shows"] = {n: visible(drawn, made, moving=True) for n in drawn.nuisances if n in (DIFFERING, DRIFT)}
     truth_file.parent.mkdir(parents=True, exist_ok=True)
     truth_file.write_text(json.dumps(known, indent=1))

@@ -15,10 +15,11 @@ from scipy.linalg import expm
 
 from simulators.model import Declared
 from tests.exam import __main__ as main
-from tests.exam import campaign, mujoco_plants, rivals, score, table, tool
+from tests.exam import campaign, mujoco_plants, nuisances, rivals, score, table, tool
 from tests.exam.draw import CLOSED, FULL, NONE, ONE, POSITION, SHARE_OF_CONDITION, TWO, Set, draw, possible
 from tests.exam.examine import places
 from tests.exam.integrate import simulate
+from tests.exam.nuisances import DIFFERING, DRIFT
 from tests.exam.planted import ABSORBED, EFFECTS, LATE_SENSOR, by_key
 from tests.exam.plants import SYSTEMS
 from tests.exam.record import plant, record
@@ -266,6 +267,37 @@ def test_two_effects_are_planted_where_each_can_be_seen_beside_the_other(
         assert beside < 1e-3 * min(visible(d, record(d)) for d in alone)
 
 
+@pytest.mark.parametrize(("nuisance", "other"), [(DRIFT, DIFFERING), (DIFFERING, DRIFT)])
+def test_what_no_constant_is_worth_goes_with_its_square_and_the_noise(
+    monkeypatch: pytest.MonkeyPatch, nuisance: str, other: str
+) -> None:
+    drawn = one("cart", "quadratic_drag@v", strength=0.3)._replace(nuisances=(nuisance,))
+
+    def worth(drawn: Set) -> float:
+        return visible(drawn, record(drawn), moving=True)
+
+    quiet, loud = (worth(drawn._replace(noise=noise)) for noise in (0.001, 0.01))
+    assert quiet == pytest.approx(100 * loud, rel=0.1)
+    assert worth(drawn._replace(nuisances=())) == 0
+    for name in ("DRIFTS", "DIFFERS"):
+        monkeypatch.setattr(nuisances, name, getattr(nuisances, name) / 3)
+    assert worth(drawn._replace(noise=0.001)) == pytest.approx(quiet / 9, rel=0.2)
+    assert worth(drawn._replace(nuisances=(other,), noise=0.001)) != pytest.approx(quiet / 9, rel=0.05)
+
+
+def test_the_table_says_how_often_a_drift_is_named_where_it_shows() -> None:
+    scores = pd.DataFrame({
+        "index": range(3), "system": "cart", "kind": "none", "outcome": "right", "noise": 0.01, "condition": FULL,
+        "world": "own", "evidence": np.nan,
+        "named": [json.dumps({"drift": said}) for said in (True, False, False)],
+        "shows": [json.dumps({"drift": nats}) for nats in (300.0, 9.9, 12.0)],
+    })  # fmt: skip
+    rows = {line.split(" | ")[0].strip("| "): line for line in table.report(scores).splitlines()}
+    assert "1/3 = 33.3 %" in rows["nuisance named: drift"]
+    assert "1/2 = 50.0 %" in rows["- drift, where it is worth >= 10 nats"]
+    assert "- drift, where it is worth >= 10 nats" not in table.report(scores.drop(columns="shows"))
+
+
 def test_one_sensor_at_the_end_of_a_linear_chain_sees_no_further_coupling() -> None:
     worth = {
         c: visible(d, record(d)) for c in (FULL, POSITION) if (d := one("thermal", "thermal_coupling@T_1", condition=c))
@@ -303,6 +335,7 @@ EITHER = claim("constant_load", "input_offset") | {"class_acts_on": {"constant_l
 ASYMMETRIC = claim("asymmetric_friction")
 PAIR = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "input_offset", "acts_on": "u"}]
 BESIDE_A_NUISANCE = [{"name": "coulomb_friction", "acts_on": "v"}, {"name": "sensor_delay", "acts_on": "v"}]
+RIVALS = [{"name": n, "acts_on": "v", "same": n == "asymmetric_friction"} for n in ("asymmetric_friction", "drag")]
 LEFT = {"acts_on": "v", "depends_on": ["v"]}
 LATE = claim("sensor_delay") | {"class_members": [{"name": "sensor_delay", "acts_on": "v"}]}
 LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
@@ -337,6 +370,7 @@ LATE_OR_SLOW = claim("sensor_delay", "sensor_lag") | {
         ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "tie"),
         ("two", [LOAD, COULOMB], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "tie"),
         ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}, claim("leak")), "wrong"),
+        ("two", [COULOMB, LOAD], verdict(ASYMMETRIC | {"same_as_two": [PAIR], "class_members": RIVALS}), "tie"),
         ("two", [COULOMB, DELAY], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
         ("one", [COULOMB], verdict(ASYMMETRIC | {"same_as_two": [PAIR]}), "wrong"),
         ("one", [COULOMB], verdict(ASYMMETRIC | {"same_as_two": [BESIDE_A_NUISANCE]}), "tie"),

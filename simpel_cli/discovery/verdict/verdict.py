@@ -279,7 +279,7 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
             return f"{listed[0].upper()}{listed[1:]} explain{'s' if len(parts) == 1 else ''} {much}. {gain}{rest}"
         case "ambiguous":
             tied = next(e for e in found["effects"] if len(_distinct(e)) > 1)
-            names = " or ".join(_distinct(tied))
+            names = ", or ".join([" or ".join(_distinct(tied)), *_pairs(tied)])
             also = (
                 f" Also found: {' and '.join(_phrase(e) for e in found['effects'] if e is not tied)}."
                 if len(parts) > 1
@@ -309,9 +309,18 @@ def _phrase(effect: dict[str, Any]) -> str:
     )
     aliases = _labels(effect, [m for m in effect["class_members"][1:] if m["same"]])
     also = f", in this model the same as {' and '.join(aliases)}" if aliases else ""
-    pairs = [
-        " with ".join(f"{m['name'].replace('_', ' ')} on {m['acts_on']}" for m in pair)
-        for pair in effect["same_as_two"]
-    ]
+    pairs = _pairs(effect)
     two = f" (which these data cannot tell from {', or from '.join(pairs)})" if pairs else ""
     return f"{effect['name'].replace('_', ' ')} on {effect['acts_on']} ({values}){also}{two}"
+
+
+def _pairs(effect: dict[str, Any]) -> list[str]:
+    """Return in words the two effects that do as well as one; pairs with the same first, and place of the second, are one."""
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for first, second in effect["same_as_two"]:
+        one = f"{first['name'].replace('_', ' ')} on {first['acts_on']}"
+        grouped.setdefault((one, second["acts_on"]), []).append(second["name"].replace("_", " "))
+    return [
+        f"{first} with {' or '.join([', '.join(names[:-1]), names[-1]] if names[1:] else names)} on {place}"
+        for (first, place), names in grouped.items()
+    ]

@@ -1,7 +1,8 @@
 """Two effects in place of one that holds one of them.
 
 Dry friction that differs between the directions is Coulomb friction beside a constant load, but for the lowest speeds. Neither
-name is wrong where the data show little of those, and one effect is the shorter answer: the pairs are said beside it.
+name is wrong where the data show little of those, and one effect is the shorter answer: the pairs are said beside it. So are
+those of an effect that nearly won: a dead zone beside an offset of one sensor may look like a scale of another one.
 """
 
 import numpy as np
@@ -13,13 +14,16 @@ from simulators.effects import Term
 # of what an effect explains beyond its special case: so much another one has to promise to first order, which is about the
 # best size of the special case alone, and may be far from that of both
 A_GOOD_PART = 0.2
+NEAR = asked(2)  # nats behind the chosen effect: so much a second effect has to earn, which may be what it lacks
+NEARLY_WON = 2  # effects that are asked, of those alike one
 FITTED = 8  # pairs: what promises to saturate a signal promises too much, and is fitted in vain
 
 
 def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, Term]]:
-    """Return the pairs that do as well as one chosen effect, or little better: a special case where it acts, and another one.
+    """Return the pairs that do as well as one chosen effect, or little better: a special case where it acts, or an effect that
+    nearly won in its place, and another one.
 
-    Neither alone does, and the other one is no more general form of the special case: that would be a rival by itself.
+    Neither alone does, and the other one is no more general form of the first: that would be a rival by itself.
 
     Args:
         search: over sets of effects.
@@ -29,7 +33,8 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
     own = chosen.terms[place]
     term, rest = search.terms[own], tuple(t for t in chosen.terms if t != own)
     simpler = [t for t in search.candidates(rest) if t != own and _is_special(search.terms[t], term)]
-    if not simpler or search.budget.over("two effects in place of one"):
+    halves = [*simpler, *(t for t in _nearly_won(search, chosen, own) if t not in simpler)]
+    if not halves or search.budget.over("two effects in place of one"):
         return []
     search.report(f"is {term.label} two effects")
     # the model may have been calibrated for another use: pairs are compared with what it is worth row by row
@@ -39,7 +44,7 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
     )
     off = search.off(whole.z, (own,))
     found: list[tuple[int, int]] = []
-    for special in simpler:
+    for special in halves:
         less = (*rest, special)
         before = Trial(less, _best(search, less, search.hypotheses(less, special, off)))
         if _as_good(before.optimum, whole) or _better(before.optimum, whole):
@@ -59,6 +64,23 @@ def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, 
             if not (known or _as_good(by_itself, whole) or _better(by_itself, whole)):
                 found.append((special, t))
     return [(search.terms[special], search.terms[t]) for special, t in found]
+
+
+def _nearly_won(search: Search, chosen: Trial, own: int) -> list[int]:
+    """Return the effects that did nearly as well as a chosen one in its place, best first; of those that are alike one."""
+    rest = tuple(t for t in chosen.terms if t != own)
+    best = search.known.get(frozenset(chosen.terms), chosen.optimum).log_evidence
+    known = [(t, search.known.get(frozenset((*rest, t)))) for t in search.candidates(rest) if t != own]
+    near = sorted(
+        ((t, fit) for t, fit in known
+         if fit is not None and not search.terms[t].depends_on and 0 < best - fit.log_evidence < NEAR),
+        key=lambda found: -found[1].log_evidence,
+    )  # fmt: skip
+    apart: list[tuple[int, Optimum]] = []
+    for t, fit in near:
+        if not any(abs(fit.loss - other.loss) <= SAME for _, other in apart):
+            apart.append((t, fit))
+    return [t for t, _ in apart[:NEARLY_WON]]
 
 
 def _is_special(simple: Term, general: Term) -> bool:
