@@ -121,8 +121,8 @@ def test_what_nearly_won_may_be_one_of_two_effects(noise: float, nearly: bool) -
             " (which these data cannot tell from coulomb on v with load or offset on v)",
         ),
         (
-            [("dead_zone", "load"), ("dead_zone", "drag"), ("dead_zone", "offset"), ("lag", "load")],
-            " (which these data cannot tell from dead zone on v with load, drag or offset on v, or from lag on v with load on v)",
+            [("gap", "load"), ("gap", "drag"), ("gap", "offset"), ("lag", "load")],
+            " (which these data cannot tell from gap on v with load, drag or offset on v, or from lag on v with load on v)",
         ),
     ],
 )

@@ -7,7 +7,10 @@ _LEVEL: dict[str, tuple[frozenset[str], ...]] = {
         frozenset({"constant_load@omega", "input_offset@u"}),
         frozenset({"gravity_tilt@omega", "sensor_bias@phi"}),
     ),
-    "cart": (frozenset({"constant_load@v", "input_offset@u", "sensor_bias@s"}),),
+    "cart": (
+        frozenset({"constant_load@v", "input_offset@u", "sensor_bias@s"}),
+        frozenset({"sensor_scale@s", "sensor_scale@v"}),
+    ),
     "tanks": (frozenset({"constant_inflow@h_1", "input_offset@u"}),),
     "thermal": (
         frozenset({"constant_inflow@T_1", "input_offset@u"}),
@@ -43,7 +46,8 @@ def twins(system: str, key: str, *, position_only: bool) -> list[str]:
 
     A constant force is an offset of the motor (its gain is a parameter); a spring at rest elsewhere is a sensor's bias;
     an angle sensor's bias is a tilt; two temperatures with free exchange rates take up every constant; where one sensor
-    reports everything, it is late as much as the input is; with one speed, dry friction is rolling resistance.
+    reports everything, it is late as much as the input is; with one speed, dry friction is rolling resistance. A linear cart
+    whose mass, spring and friction are free may be measured in any unit of length: a speed's scale is a position's.
     """
     groups = _LEVEL[system] + (_ONE_SENSOR.get(system, ()) if position_only else ())
     return sorted({other for group in groups if key in group for other in group} - {key})

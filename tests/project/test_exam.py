@@ -208,6 +208,18 @@ def test_a_constant_force_is_an_offset_of_the_motor(system: str) -> None:
     assert np.abs(force - told.rate(x, u, p)).max() > 0
 
 
+def test_of_a_linear_cart_the_scale_of_a_speed_is_that_of_a_position() -> None:
+    told, scale = SYSTEMS["cart"], 1.3
+    random = np.random.default_rng(6)
+    p = {name: (low + high) / 2 for name, (low, high) in told.ranges.items()}
+    other = p | {name: p[name] / scale for name in ("M", "K", "b")}
+    start, commands = told.start(random, 3), told.commands(random, 3, 60)
+    here, _, _ = simulate(plant(told, p, (), ()), start, commands, told.dt)
+    there, _, _ = simulate(plant(told, other, (), ()), scale * start, commands, told.dt)
+    np.testing.assert_allclose(here * [1, scale], there / [scale, 1], atol=1e-9)
+    assert twins("cart", "sensor_scale@v", position_only=False) == ["sensor_scale@s"]
+
+
 @pytest.mark.parametrize(("system", "key"), [(s, e.key) for s in SYSTEMS for e in EFFECTS[s] if e.group == ABSORBED])
 def test_what_parameters_take_in_cannot_be_seen(system: str, key: str) -> None:
     drawn = one(system, key, strength=0.05)

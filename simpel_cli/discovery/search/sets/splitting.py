@@ -20,10 +20,10 @@ FITTED = 8  # pairs: what promises to saturate a signal promises too much, and i
 
 
 def two_in_place(search: Search, chosen: Trial, place: int) -> list[tuple[Term, Term]]:
-    """Return the pairs that do as well as one chosen effect, or little better: a special case where it acts, or an effect that
-    nearly won in its place, and another one.
+    """Return the pairs that do as well as one chosen effect, or little better.
 
-    Neither alone does, and the other one is no more general form of the first: that would be a rival by itself.
+    One of the two is a special case where it acts, or an effect that nearly won in its place. Neither alone does, and the other
+    one is no more general form of the first: that would be a rival by itself.
 
     Args:
         search: over sets of effects.
