@@ -16,6 +16,9 @@ the training part without its tail; the free run of the tail chooses among order
 is then fitted on to the whole training part; no run chooses by the test. In the table, *tail* is the error there, in standard
 deviations of the outputs: of the best, the median and the worst of all that were tried.
 
+With `--exam DIR --sets 100` the same is done with sets of a blind exam that was run (`tests.exam`), without its equations: the
+table has the errors of free runs in those of `simpel discover`.
+
 Two recordings have no input: `free_pendulum`, whose model only decays from its first state, and `ball_drops`, where each ball
 has a linear model of two states, driven by the constant. The car is left out: `specialists`, whose protocol this is, lacks it.
 
@@ -28,6 +31,7 @@ Reference: Bemporad (2025), IEEE Trans. Autom. Control, for the tool; Chiuso (20
 import argparse
 import contextlib
 import io
+import json
 import os
 import time
 from collections.abc import Sequence
@@ -37,6 +41,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jax_sysid.models import Model  # type: ignore[import-not-found]  # not in the project's own environment
 from scipy.optimize import least_squares
 from specialists import RIGS, Rig, Run
@@ -365,6 +370,61 @@ def examined(name: str, rig: Rig, setup: Setup) -> list[str]:
     return lines
 
 
+OF_EXAM = Setup((2, 3), (0,), (1e-3, 1e-4))
+OF_CAR = OF_EXAM._replace(orders=(4, 5))
+FIRST = 6  # rows of a test episode that tell its first state, as in `simpel discover`
+
+
+def of_exam(out: Path, index: int) -> dict[str, Any] | None:
+    """Return the errors of free runs of a set of an exam, linear and nonlinear, in those of `simpel discover`.
+
+    None: it was not run, has nothing planted, or episodes without some of their values.
+    """
+    folder, path = out / "sets" / str(index), out / "truth" / f"{index}.json"
+    verdict = folder / "run" / "verdict.json"
+    if not verdict.exists() or not (truth := json.loads(path.read_text()))["effects"]:
+        return None
+    table = pd.read_parquet(folder / "data" / "run.parquet")
+    table = table.drop(columns=[n for n in ("unit",) if n in table])
+    ours = json.loads(verdict.read_text())["error"]["after"]["free_run"]
+    measured = [n for n in truth["measured"] if n in ours]
+    inputs = [n for n in table if n not in ("episode", "t", "split", *truth["measured"])]
+    if table[[*measured, *inputs]].isna().any(axis=None):
+        return None
+    runs: dict[str, list[Run]] = {"train": [], "test": []}
+    for _, part in table.groupby("episode"):
+        runs[part.split.iloc[0]].append(Run(*(part[n].to_numpy(float) for n in ("t", inputs, measured))))
+    began = time.perf_counter()
+    scale, choices = chosen(runs["train"], OF_CAR if truth["system"] == "car" else OF_EXAM, FIRST)
+    row: dict[str, Any] = {"index": index, "system": truth["system"], "condition": truth["condition"]}
+    for name, choice in zip(("linear", "nonlinear"), choices, strict=True):
+        errors = np.concatenate([free_run(choice.model, *scale.of(run), FIRST) for run in runs["test"]]) * scale.y_size
+        with np.errstate(over="ignore"):
+            least = np.sqrt(np.mean(errors**2, axis=0)) / np.array([ours[n] for n in measured])
+        row[name] = float(np.exp(np.mean(np.log(least))))
+    return row | {"seconds": time.perf_counter() - began}
+
+
+def exam_table(out: Path, sets: int) -> str:
+    """Examine sets of an exam, keep what was found beside it, and return the table."""
+    rows = []
+    for index in range(sets):
+        row = of_exam(out, index)
+        if row is not None:
+            rows.append(row)
+            print(
+                f"{index} {row['system']} {row['linear']:.3g} {row['nonlinear']:.3g} {row['seconds']:.0f} s", flush=True
+            )
+    table = pd.DataFrame(rows)
+    table.to_parquet(out / "state_space.parquet")
+    lines = ["| sets | n | linear | nonlinear | the better one is better than simpel |", "|---|---|---|---|---|"]
+    for name, part in [("all", table), *table.groupby("system")]:
+        ahead = int((part[["linear", "nonlinear"]].min(axis=1) < 1).sum())
+        medians = " | ".join(f"{part[kind].median():.2f}" for kind in ("linear", "nonlinear"))
+        lines.append(f"| {name} | {len(part)} | {medians} | {ahead}/{len(part)} |")
+    return "\n".join(lines)
+
+
 def _two(cells: list[str]) -> list[str]:
     return [*cells, "-"][:2]
 
@@ -385,10 +445,16 @@ def main() -> None:
     """Fit and print."""
     parser = argparse.ArgumentParser(prog="tests/benchmarks/state_space.py", description=__doc__)
     parser.add_argument("--only", nargs="*", default=list(SETUPS), choices=list(SETUPS))
+    parser.add_argument("--exam", type=Path, metavar="DIR", help="sets of an exam that was run, in place of recordings")
+    parser.add_argument("--sets", type=int, default=100, help="of the exam, the first so many")
+    options = parser.parse_args()
+    if options.exam:
+        print(exam_table(options.exam, options.sets))
+        return
     shared = Path(os.environ.get("SIMPEL_SHARED", "../shared"))
     print("| recording | output | unit | linear | nonlinear | linear: chosen | nonlinear: chosen | note |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
-    for name in parser.parse_args().only:
+    for name in options.only:
         print("\n".join(examined(name, RIGS[name](shared), SETUPS[name])), flush=True)
 
 

@@ -1,22 +1,20 @@
 """From a set to what its sensors read: plant, episodes, sensors, noise. Of this the tool gets what was measured only."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tests.exam import mujoco_plants, nuisances
 from tests.exam.draw import CLOSED, DERIVED, NONE, OUTLIERS, QUANTISED, SHAKEN, Set
-from tests.exam.integrate import Rate, simulate
-from tests.exam.planted import DELAY, INPUT, LAG, LATE_SENSOR, OWN_RATE, PLAY, RATE, SENSOR, SLOW_SENSOR, Effect
+from tests.exam.integrate import simulate
 from tests.exam.plants import SYSTEMS, System
+from tests.exam.rig import ROWS, before, driven, plant, read
 from tests.exam.twins import twins
 
-TRAIN, TEST, ROWS = 5, 2, 60
+TRAIN, TEST = 5, 2
 PROCESS = 0.02  # of a rate's standard deviation times the square root of a row: what one row adds of process noise
 OUTLIER_SHARE, OUTLIER_SIZE = 0.02, 12.0  # of the rows; of the noise
 STEP = 2.0  # of the noise: the least digit of a quantised sensor
-SETTLED = 8.0  # lags of a slow sensor after which its start is forgotten
 DITHER = 0.1  # of the input's range, on top of a controller's command
 
 
@@ -52,17 +50,10 @@ def record(drawn: Set) -> Record:
     seconds = ROWS * system.dt
     _, at = nuisances.parameters_of(drawn.nuisances, random_of(drawn, 1), parameters, count, seconds)
     controller = _controller(system, random, count) if drawn.condition == CLOSED else None
-    lead, share, channel = _late_sensor(drawn, system, effects, knobs)
-    behind = lead
-    settling = _settling(system, effects, knobs)
-    if lead:
-        commands[:, :lead] = commands[:, lead : lead + 1]
-    if settling.any():  # the sensor follows the motion before the record begins
-        lead = int(np.ceil(SETTLED * settling.max() / system.dt - 1e-9))
-        commands = np.concatenate([np.repeat(commands[:, :1], lead, axis=1), commands], axis=1)
+    began = before(drawn, knobs, commands)
     diffusion = None
     if drawn.condition == SHAKEN:
-        quiet, _, _ = simulate(plant(system, parameters, effects, knobs), start, commands, system.dt)
+        quiet, _, _ = simulate(plant(system, parameters, effects, knobs), start, began.commands, system.dt)
         spread = (np.diff(quiet, axis=1) / system.dt).std(axis=(0, 1))
         moved = np.array([name in system.driven for name in system.states])
         diffusion = np.where(moved, PROCESS * spread * np.sqrt(system.dt), 0.0)
@@ -70,22 +61,15 @@ def record(drawn: Set) -> Record:
         model = mujoco_plants.world(
             drawn.system, parameters, *((effects[0].name, knobs[0]) if effects else ("", {})), system.dt
         )
-        states, commands = mujoco_plants.simulate(model, start, commands, controller)
+        states, commands = mujoco_plants.simulate(model, start, began.commands, controller)
         tapped = states
     else:
-        late, slow, play = (_of_inputs(system, effects, knobs, kind) for kind in (DELAY, LAG, PLAY))
-        states, tapped, commands = simulate(
-            plant(system, parameters, effects, knobs, at), start, commands, system.dt, controller=controller,
-            delay=late, lag=slow, play=play, diffusion=diffusion, random=random, tap=share * system.dt, sensor_lag=settling,
-            linear=nuisances.LINEAR in drawn.nuisances,
-        )  # fmt: skip
-    rows = slice(lead, lead + ROWS)
+        states, tapped, commands = driven(
+            drawn, began, parameters, knobs, start, at, controller=controller, diffusion=diffusion, random=random
+        )
+    rows = slice(began.lead, began.lead + ROWS)
     true, given = states[:, rows], commands[:, rows]
-    clean = _sensors(system, effects, knobs, true)
-    if channel is not None:  # a late sensor reads what was `share` of a row after the row before, or the one before it
-        clean[..., channel] = tapped[:, lead - behind : lead - behind + ROWS, channel]
-    for i in np.flatnonzero(settling):
-        clean[..., i] = tapped[:, rows, i]
+    clean = read(drawn, began, knobs, states, tapped)
     noise = drawn.noise * clean[:TRAIN].std(axis=(0, 1))
     measured = clean + noise * nuisances.noise_of(drawn.nuisances, random, clean.shape)
     measured = nuisances.faulty(drawn.nuisances, system, measured, noise, random_of(drawn, 2))
@@ -95,39 +79,6 @@ def record(drawn: Set) -> Record:
 def random_of(drawn: Set, use: int) -> np.random.Generator:
     """Return random numbers of a set that are no others': a nuisance changes nothing else of it."""
     return np.random.default_rng((drawn.seed, use))
-
-
-def plant(
-    system: System,
-    parameters: dict[str, float],
-    effects: tuple[Effect, ...],
-    knobs: tuple[dict[str, float], ...],
-    at: Callable[[float], dict[str, Any]] | None = None,
-) -> Rate:
-    """Return the right-hand side with everything planted that acts on rates and inputs; at: parameters at a time."""
-
-    def rate(x: np.ndarray, u: np.ndarray, t: float) -> np.ndarray:
-        u = np.array(u)
-        for effect, k in zip(effects, knobs, strict=True):
-            if effect.kind == INPUT:
-                j = system.inputs.index(effect.acts_on)
-                u[..., j] = effect.formula(u[..., j], k)
-        dx = system.rate(x, u, parameters if at is None else at(t))
-        for effect, k in zip(effects, knobs, strict=True):
-            if effect.kind not in (RATE, OWN_RATE):
-                continue
-            i = system.states.index(effect.acts_on)
-            if effect.kind == OWN_RATE:
-                dx[..., i] = effect.formula(dx[..., i], k, x)
-            elif effect.name == "added_inertia":
-                dx[..., i] /= 1 + k["alpha"]
-            else:
-                partner = system.velocity.get(effect.acts_on)
-                other = system.states.index(partner) if partner else (1 - i if len(system.states) == 2 else i)
-                dx[..., i] += effect.formula(x[..., i], x[..., other], t, k, x, u)
-        return dx
-
-    return rate
 
 
 def truth(drawn: Set, made: Record) -> dict[str, Any]:
@@ -154,51 +105,6 @@ def truth(drawn: Set, made: Record) -> dict[str, Any]:
         else {n: {"value": v, "range": ranges[n]} for n, v in made.parameters.items() if n != absent},
         "may_be": sorted(nuisances.may_be(drawn.nuisances, SYSTEMS[drawn.system])),
     }
-
-
-def _of_inputs(
-    system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...], kind: str
-) -> list[float]:
-    found = dict.fromkeys(system.inputs, 0.0)
-    for effect, k in zip(effects, knobs, strict=True):
-        if effect.kind == kind:
-            found[effect.acts_on] += next(iter(k.values()))
-    return list(found.values())
-
-
-def _settling(system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]) -> np.ndarray:
-    """Time constant of every state's sensor, s."""
-    found = np.zeros(len(system.states))
-    for effect, k in zip(effects, knobs, strict=True):
-        if effect.kind == SLOW_SENSOR:
-            found[system.states.index(effect.acts_on)] = k["tau"]
-    return found
-
-
-def _late_sensor(
-    drawn: Set, system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...]
-) -> tuple[int, float, int | None]:
-    """Rows in front of the record, share of a row at which the states are recorded once more, and the late channel."""
-    if nuisances.LATE in drawn.nuisances:
-        rows = nuisances.ROWS_LATE
-        speed = system.states.index(next(iter(system.velocity)))
-        return int(np.ceil(rows)), float(np.ceil(rows) - rows), speed
-    for effect, k in zip(effects, knobs, strict=True):
-        if effect.kind == LATE_SENSOR:
-            rows = k["d"] / system.dt
-            return int(np.ceil(rows - 1e-9)), float(np.ceil(rows - 1e-9) - rows), system.states.index(effect.acts_on)
-    return 0, 0.0, None
-
-
-def _sensors(
-    system: System, effects: tuple[Effect, ...], knobs: tuple[dict[str, float], ...], true: np.ndarray
-) -> np.ndarray:
-    read = true.copy()
-    for effect, k in zip(effects, knobs, strict=True):
-        if effect.kind == SENSOR:
-            i = system.states.index(effect.acts_on)
-            read[..., i] = effect.formula(read[..., i], k)
-    return read
 
 
 def _faults(drawn: Set, system: System, y: np.ndarray, noise: np.ndarray, random: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,8 @@ from tests.exam import nuisances
 from tests.exam.draw import Set
 from tests.exam.integrate import simulate
 from tests.exam.plants import SYSTEMS
-from tests.exam.record import ROWS, TEST, TRAIN, Record, plant, random_of
+from tests.exam.record import TEST, TRAIN, Record, random_of
+from tests.exam.rig import ROWS, plant
 
 WINDOW = 15  # rows: short enough for first order
 STEP = 1e-4  # of a range or of a state's standard deviation

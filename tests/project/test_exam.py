@@ -22,7 +22,8 @@ from tests.exam.integrate import simulate
 from tests.exam.nuisances import DIFFERING, DRIFT
 from tests.exam.planted import ABSORBED, EFFECTS, LATE_SENSOR, by_key
 from tests.exam.plants import SYSTEMS
-from tests.exam.record import plant, record
+from tests.exam.record import record
+from tests.exam.rig import plant
 from tests.exam.twins import apart, twins
 from tests.exam.visible import visible
 from tests.exam.write import write
@@ -38,6 +39,7 @@ GENERATOR = (
     "draw",
     "twins",
     "record",
+    "rig",
     "visible",
     "write",
 )
