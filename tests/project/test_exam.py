@@ -133,7 +133,8 @@ def test_late_and_lagging_commands_and_late_records_agree_with_the_matrix_expone
 
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_every_effect_is_recorded_and_shows(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.exam.record.ROWS", 20)  # a third of a set, for speed
+    for module in ("rig", "record"):
+        monkeypatch.setattr(f"tests.exam.{module}.ROWS", 20)  # a third of a set, for speed
     without = record(one(system, noise=QUIET)).measured
     assert np.isfinite(without).all()
     assert EFFECTS[system]
