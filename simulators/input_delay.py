@@ -7,6 +7,7 @@ import casadi
 
 from simulators.expression import Symbol
 from simulators.model import Model
+from simulators.quantity import Quantity
 
 
 class Arriving(NamedTuple):
@@ -14,16 +15,23 @@ class Arriving(NamedTuple):
 
     Args:
         mean: (du, 1).
-        rise: from the beginning to the end, (du, 1); None: no input is linear, and what is held does not rise.
+        rise: from the beginning to the end, (du, 1); None: no input is linear or late, and what is held does not rise.
+        linear: rows of the inputs that are linear between rows.
 
     """
 
     mean: Symbol
     rise: Symbol | None
+    linear: tuple[int, ...] = ()
 
     def at(self, share: float) -> Symbol:
         """Return the inputs after a share of the substep, (du, 1)."""
         return self.mean if self.rise is None else self.mean + (share - 0.5) * self.rise
+
+    def read(self) -> Symbol:
+        """Return the inputs that what is read at the beginning goes by, (du, 1): of what is held the mean."""
+        begin = self.at(0.0)
+        return casadi.vertcat(*((begin if i in self.linear else self.mean)[i] for i in range(self.mean.shape[0])))
 
 
 def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Arriving]:
@@ -36,8 +44,8 @@ def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Arriving]:
         p: uncertain parameters, which a delay or a lag may be.
 
     The mean over a substep that lies d in the past is a sum over rows: of a held input each is weighted with the share of the
-    substep that it fills, of a linear one with the integral of its hat function, and the first moment likewise. A lag follows
-    that exactly, settled at its first value.
+    substep that it fills, of a linear one with the integral of its hat function, and the first moment likewise, which says when
+    in a substep a held one arrives. A lag follows that exactly, settled at its first value.
 
     """
     du, past, linear = len(model.inputs), model.past(), model.linear
@@ -57,12 +65,11 @@ def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Arriving]:
         late = seconds(model.delay.get(q.name, 0.0)) / model.dt
         values = [row[i] for row in rows]
         line = _linear([*values, following[i]], late, model) if i in following else _held(values, late, model)
-        each.append(_lagged(line, seconds(model.lag[q.name]), model) if q.name in model.lag else line)
+        line = _lagged(line, seconds(model.lag[q.name]), model) if q.name in model.lag else line
+        each.append(line if i in following else _within(line, q, values))
     last = [line[-model.substeps :] for line in each]
     return [
-        Arriving(
-            casadi.vertcat(*(line[s][0] for line in last)), casadi.vertcat(*(line[s][1] for line in last)) if linear else None
-        )
+        Arriving(casadi.vertcat(*(line[s][0] for line in last)), casadi.vertcat(*(line[s][1] for line in last)), linear)
         for s in range(model.substeps)
     ]  # fmt: skip
 
@@ -71,20 +78,23 @@ Line = list[tuple[Symbol, Symbol]]  # mean and rise of one input at every subste
 
 
 def _held(rows: Sequence[Symbol], late: Symbol, model: Model) -> Line:
-    """Return a held input; `late` in rows. What it rises within a substep in which it jumps is left out."""
+    """Return a held input; `late` in rows."""
     past, n = len(rows) - 1, model.substeps
+    if isinstance(late, float) and late == 0.0:
+        return [(rows[r], 0.0) for r in range(past + 1) for _ in range(n)]
+    return _weighed(rows, [[_box(past - j + s / n - late, 1 / n) for j in range(past + 1)] for s in range(n)], past)
 
-    def passed(k: int, j: int) -> Symbol:
-        return casadi.fmin(casadi.fmax(past - j + k / n - late, 0.0), 1.0)
 
-    shares = [[n * (passed(s + 1, j) - passed(s, j)) for j in range(past + 1)] for s in range(n)]
-    for share in shares:  # later than all that is known: the oldest
-        share[0] = share[0] + 1 - sum(share)
-
-    def mean(r: int, s: int) -> Symbol:
-        return sum(share * rows[max(0, r - past + j)] for j, share in enumerate(shares[s]))
-
-    return [(mean(r, s), 0.0) for r in range(past + 1) for s in range(n)]
+def _within(line: Line, q: Quantity, given: Sequence[Symbol]) -> Line:
+    """Return a line that keeps to the range of its input, or to what was given beyond that; its mean stays."""
+    low, high = q.low, q.high
+    for value in given:
+        low, high = casadi.fmin(low, value), casadi.fmax(high, value)
+    found = []
+    for mean, rise in line:
+        most = casadi.fmax(2 * casadi.fmin(mean - low, high - mean), 0.0)
+        found.append((mean, casadi.fmin(casadi.fmax(rise, -most), most)))
+    return found
 
 
 def _linear(rows: Sequence[Symbol], late: Symbol, model: Model) -> Line:
@@ -97,34 +107,45 @@ def _linear(rows: Sequence[Symbol], late: Symbol, model: Model) -> Line:
             for s in range(n)
         ]
     # of the row in question, those before it and the one after it; before the first row the input stood still
-    weights = [[_hat(past - j + s / n - late, 1 / n) for j in range(past + 2)] for s in range(n)]
-    for one in weights:
+    return _weighed(rows, [[_hat(past - j + s / n - late, 1 / n) for j in range(past + 2)] for s in range(n)], past)
+
+
+def _weighed(rows: Sequence[Symbol], weights: list[list[tuple[Symbol, Symbol]]], past: int) -> Line:
+    """Return the line of every substep of all rows; weights: of the rows near one, in each of its substeps."""
+    for one in weights:  # later than all that is known: the oldest
         one[0] = (one[0][0] + 1 - sum(mean for mean, _ in one), one[0][1] - sum(rise for _, rise in one))
 
-    def line(r: int, s: int) -> tuple[Symbol, Symbol]:
-        near = [rows[max(0, r - past + j)] for j in range(past + 2)]
-        mean, rise = (sum(w[k] * v for w, v in zip(weights[s], near, strict=True)) for k in (0, 1))
+    def line(r: int, share: list[tuple[Symbol, Symbol]]) -> tuple[Symbol, Symbol]:
+        near = [rows[max(0, r - past + j)] for j in range(len(share))]
+        mean, rise = (sum(w[k] * v for w, v in zip(share, near, strict=True)) for k in (0, 1))
         return mean, rise
 
-    return [line(r, s) for r in range(past + 1) for s in range(n)]
+    return [line(r, share) for r in range(past + 1) for share in weights]
+
+
+def _clipped(t: Symbol, low: float) -> Symbol:
+    return casadi.fmin(casadi.fmax(t - low, 0.0), 1.0)
+
+
+def _box(begin: Symbol, length: float) -> tuple[Symbol, Symbol]:
+    """Return mean and rise, over [begin, begin + length], of the box that begins at 0, one row long: it fills an end of it."""
+    share = (_clipped(begin + length, 0.0) - _clipped(begin, 0.0)) / length
+    return share, 6 * share * (1 - share) * casadi.if_else(begin <= 0, 1.0, -1.0)
 
 
 def _hat(begin: Symbol, length: float) -> tuple[Symbol, Symbol]:
     """Return mean and rise, over [begin, begin + length], of the hat function about 0; the rise keeps the first moment."""
-    end = begin + length
-
-    def clipped(t: Symbol, low: float) -> Symbol:
-        return casadi.fmin(casadi.fmax(t - low, 0.0), 1.0)
 
     def area(t: Symbol) -> Symbol:
-        up, down = clipped(t, -1.0), clipped(t, 0.0)
+        up, down = _clipped(t, -1.0), _clipped(t, 0.0)
         return up**2 / 2 + down - down**2 / 2
 
     def twice(t: Symbol) -> Symbol:
         """Integral of the area."""
-        up, down = clipped(t, -1.0), clipped(t, 0.0)
+        up, down = _clipped(t, -1.0), _clipped(t, 0.0)
         return up**3 / 6 + down / 2 + down**2 / 2 - down**3 / 6 + casadi.fmax(t - 1.0, 0.0)
 
+    end = begin + length
     moment = length / 2 * (area(end) + area(begin)) - (twice(end) - twice(begin))
     return (area(end) - area(begin)) / length, 12 * moment / length**2
 

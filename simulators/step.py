@@ -23,7 +23,7 @@ def one_step(model: Model) -> casadi.Function:
     x, p = (casadi.MX.sym(name, len(group), 1) for name, group in (("x", model.states), ("p", model.params)))
     u = casadi.MX.sym("u", du * (past + 1) + len(model.linear), 1)
     arriving = delayed_inputs(model, u, p)
-    y = model.function()(x, arriving[0].at(0.0), p)[1]
+    y = model.function()(x, arriving[0].read(), p)[1]
     names = ["x", "u", "p"], ["next", "y"]
     if not model.states:
         return casadi.Function(f"{model.name}_step", [x, u, p], [casadi.MX(0, 1), y], *names)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from simpel_cli.dynamics.input_delay import delayed_inputs
+from simpel_cli.dynamics.input_delay import as_read, delayed_inputs
 from simulators.model import Model
 
 
@@ -29,7 +29,10 @@ def arriving(
 ) -> Float[Array, "T substeps K du"]:
     """Return the inputs of every substep of the rows behind the lead (see `delayed_inputs`)."""
     late = seconds(model, model.delay, phi), seconds(model, model.lag, phi)
-    return delayed_inputs(rows, *late, dt=model.dt, substeps=model.substeps, lead=lead, linear=model.linear)
+    return delayed_inputs(
+        rows, *late, dt=model.dt, substeps=model.substeps, lead=lead, linear=model.linear,
+        ranges=[(q.low, q.high) for q in model.inputs],
+    )  # fmt: skip
 
 
 def acting(model: Model, inputs: np.ndarray, phi: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -44,4 +47,4 @@ def acting(model: Model, inputs: np.ndarray, phi: Sequence[float] | np.ndarray) 
     before, after = np.repeat(inputs[:1], past, axis=0), inputs[-1:] if model.linear else inputs[:0]
     rows = jnp.asarray(np.concatenate([before, inputs, after]))
     found = arriving(model, rows, jnp.asarray(phi, rows.dtype), past)
-    return np.asarray(found[:, 0, 0])
+    return np.asarray(as_read(found, model.linear)[:, 0, 0])

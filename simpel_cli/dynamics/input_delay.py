@@ -2,8 +2,10 @@
 
 A held input is a staircase; the mean over a substep that lies d in the past is a sum over samples, each weighted with the
 share of the substep that it fills: continuous in d, below one sample too. A linear or smooth input is such a sum of other
-kernels (`between_rows.py`); over a substep a linear one is taken for the straight line that has its mean and its first moment,
-a smooth one for the parabola that is where it is at the beginning, in the middle and at the end.
+kernels (`between_rows.py`). Over a substep an input is taken for the straight line that has its mean and its first moment, a
+smooth one for the parabola that is where it is at the beginning, in the middle and at the end. Where a held one arrives within
+a substep, the mean alone would say how far a speed moves and not when, which a position shows: an integrator of second order
+has the line's answer exactly. What is read goes by the mean (`as_read`), since at its ends the line overshoots the step.
 """
 
 from collections.abc import Sequence
@@ -31,6 +33,8 @@ def delayed_inputs(
     linear: Sequence[int] = (),
     smooth: Sequence[int] = (),
     way: Float[Array, " nu"] | None = None,
+    rising: bool = True,
+    ranges: Sequence[tuple[float, float]] = (),
 ) -> Float[Array, "T substeps K nu"]:
     """Return the input of every substep of the rows behind the lead.
 
@@ -46,10 +50,12 @@ def delayed_inputs(
         linear: inputs that move from a row to the next, straight where nothing else is said; the others are held.
         smooth: those of them that are smooth curves through their rows.
         way: from held (0) over linear (1/2) to smooth (1), per input, of those in `linear`; None: as the words say.
+        rising: whether a held input may arrive within a substep; else none is late.
+        ranges: that held inputs keep to, per input, where they were given no value beyond it; none: they may be anything.
 
     Returns:
-        The values at beginning, middle and end of every substep (K = 3) where an input is linear; else, K = 1, the mean, which
-        is held over it.
+        The values at beginning, middle and end of every substep (K = 3) where an input is linear or may rise; else, K = 1, the
+        mean, which is held over it.
     """
     if half_play is not None:
         u = play(u, half_play)
@@ -81,10 +87,11 @@ def delayed_inputs(
         return jnp.dot(near, weight.T, precision=jax.lax.Precision.HIGHEST).reshape(-1)
 
     def line(word: str, near: Array, passed: Array) -> tuple[Array, Array]:
-        """Return mean and rise over every substep; what is held does not rise."""
+        """Return mean and rise over every substep."""
         mean, rise = KERNELS[word].shares(passed)
         mean = weighed(_complete(mean, 1.0), near)  # later than all that is known: the oldest
-        return mean, jnp.zeros_like(mean) if word == HELD else weighed(_complete(rise, 0.0), near)
+        rises = rising or word != HELD
+        return mean, weighed(_complete(rise, 0.0), near) if rises else jnp.zeros_like(mean)
 
     def lagged(mean: Array, rise: Array, tau: Array) -> tuple[Array, Array]:
         """Return the exact answer of the lag to straight lines, as lines: mean and rise of every substep."""
@@ -103,8 +110,16 @@ def delayed_inputs(
         turn = 12 * ((1 - keep) / ratio**2 - (1 + keep) / (2 * ratio))  # rise of exp(-t/tau), by its first moment
         return mean - rise / ratio + fading * ((1 - keep) / ratio)[None], rise + fading * turn[None]
 
-    def one_held(near: Array, d: Array, tau: Array) -> Array:
-        return lagged(*line(HELD, near, back - d / dt), tau)[0]
+    low, high = (_ends(u, [r[k] for r in ranges], k) for k in (0, 1))
+
+    def one_held(near: Array, d: Array, tau: Array, low: Array, high: Array) -> Array:
+        mean, rise = lagged(*line(HELD, near, back - d / dt), tau)
+        if not rising:
+            return mean[None]
+        if ranges:  # beyond it a root or a logarithm may not be defined
+            most = jnp.maximum(2 * jnp.minimum(mean - low, high - mean), 0.0)
+            rise = jnp.clip(rise, -most, most)
+        return jnp.stack([mean + at * rise for at in STAGES])
 
     def one_moving(i: int, d: Array, tau: Array) -> Array:
         passed = back - d / dt
@@ -127,15 +142,38 @@ def delayed_inputs(
         return stages + parts[SMOOTH] * prompt * jnp.stack(off)
 
     if not linear:
-        every = jax.vmap(one_held, in_axes=(2, 0, 0), out_axes=1)(near, delay, lag)
-        return every.reshape(rows, substeps, 1, -1)[lead:]
-    columns = [
-        one_moving(i, delay[i], lag[i])
-        if i in linear
-        else jnp.broadcast_to(one_held(near[..., i], delay[i], lag[i]), (len(STAGES), rows * substeps))
-        for i in range(u.shape[1])
-    ]
-    return jnp.moveaxis(jnp.stack(columns, axis=-1), 0, 1).reshape(rows, substeps, len(STAGES), -1)[lead:]
+        every = jax.vmap(one_held, in_axes=(2, 0, 0, 0, 0), out_axes=2)(near, delay, lag, low, high)
+    else:
+        held = [i for i in range(u.shape[1]) if i not in linear]
+        columns = {i: one_held(near[..., i], delay[i], lag[i], low[i], high[i]) for i in held}
+        columns |= {i: one_moving(i, delay[i], lag[i]) for i in linear}
+        shape = (len(STAGES), rows * substeps)
+        every = jnp.stack([jnp.broadcast_to(columns[i], shape) for i in range(u.shape[1])], axis=2)
+    return jnp.moveaxis(every, 0, 1).reshape(rows, substeps, every.shape[0], -1)[lead:]
+
+
+def _ends(u: Array, declared: Sequence[float], side: int) -> Array:
+    """Return the lowest (0) or highest (1) value of every input, (nu,): as declared, or as given where that is beyond it."""
+    of = (jnp.min, jnp.max)[side](u, axis=0)
+    return (jnp.minimum, jnp.maximum)[side](of, jnp.array(declared, u.dtype)) if len(declared) else of
+
+
+def as_read(u: Array, linear: Sequence[int], axis: int = 2) -> Array:
+    """Return inputs of substeps (.., K, nu, ..) as readings go by them: what is held is its mean over a substep.
+
+    K is 1 in the end where no input is linear.
+
+    Args:
+        u: as of `delayed_inputs`.
+        linear: inputs that move from a row to the next.
+        axis: of K; that of the inputs stands behind it.
+    """
+    count = u.shape[axis]
+    middle = jax.lax.slice_in_dim(u, count // 2, count // 2 + 1, axis=axis)
+    if count == 1 or not linear:
+        return middle
+    moves = jnp.isin(jnp.arange(u.shape[axis + 1]), jnp.array(list(linear)))
+    return jnp.where(moves.reshape(-1, *(1,) * (u.ndim - axis - 2)), u, middle)
 
 
 def prompt_inputs(u: Float[Array, "rows nu"], substeps: int, linear: Sequence[int]) -> Float[Array, "substeps K nu"]:

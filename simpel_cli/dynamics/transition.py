@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from simpel_cli.dynamics.arriving import arriving
 from simpel_cli.dynamics.casadi_jax import checked
 from simpel_cli.dynamics.encoding import Encoding
-from simpel_cli.dynamics.input_delay import prompt_inputs
+from simpel_cli.dynamics.input_delay import as_read, prompt_inputs
 from simpel_cli.dynamics.integrate import State, rk4_step
 from simpel_cli.dynamics.late_readings import late_of
 from simpel_cli.errors import ConfigError
@@ -100,18 +100,19 @@ def transition(model: Model, encoding: Encoding) -> Transition:
         read, stacked = encoding.split_x(x)
         u = encoding.input_rows(stacked)
         acting = acting_of(u, phi) if late_inputs or late is not None else None
-        now = encoding.inputs_now(stacked) if acting is None else acting[-1, 0, 0]
-        state = read if late is None or acting is None else late.meant(read, acting[:-1], phi)
+        shown = None if acting is None else as_read(acting, model.linear)
+        now = encoding.inputs_now(stacked) if shown is None else shown[-1, 0, 0]
+        state = read if late is None or shown is None else late.meant(read, shown[:-1], phi)
         outputs = measure(state, now, phi)[1] if measure is not None and rows else state[:0]
-        if late is not None and acting is not None and rows:
-            outputs = outputs + late.behind(state, acting[:-1], phi, now)[len(read) :]
+        if late is not None and shown is not None and rows:
+            outputs = outputs + late.behind(state, shown[:-1], phi, now)[len(read) :]
         outputs = outputs[jnp.array(rows, int)] if rows else outputs
         if integrated is None:
             return encoding.to_y(read, read, outputs)
         own = prompt_inputs(u[encoding.stack :], model.substeps, model.linear) if acting is None else acting[-1]
         after = integrated(state, own, phi)
-        if late is not None and acting is not None:
-            after = after + late.behind(after, acting[1:], phi)[: len(read)]
+        if late is not None and shown is not None:
+            after = after + late.behind(after, shown[1:], phi)[: len(read)]
         return encoding.to_y(read, after, outputs)
 
     width = model.coordinates.size if model.coordinates is not None else len(model.states)

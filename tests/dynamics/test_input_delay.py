@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
+from scipy.signal import lfilter
 
 from simpel_cli.dynamics.between_rows import WAY
-from simpel_cli.dynamics.input_delay import delayed_inputs, play, slewed
+from simpel_cli.dynamics.input_delay import as_read, delayed_inputs, play, slewed
 
 DT, SUBSTEPS, LEAD = 0.1, 4, 8
 U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
@@ -15,7 +16,7 @@ U = np.random.default_rng(0).normal(size=(LEAD + 12, 1))
 
 def arrived(delay: float, lag: float, u: np.ndarray = U) -> np.ndarray:
     out = delayed_inputs(jnp.asarray(u), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
-    return np.asarray(out)[:, :, 0, 0]
+    return np.asarray(out)[:, :, 1, 0]  # the mean
 
 
 def staircase(t: np.ndarray) -> np.ndarray:
@@ -54,6 +55,56 @@ def test_a_lag_is_the_solution_of_its_equation(lag: float) -> None:
         exact.append(u + (w - u) * (1 - keep) * lag / h)
         w = u + (w - u) * keep
     np.testing.assert_allclose(arrived(0.0, lag).ravel(), np.array(exact)[LEAD * SUBSTEPS :], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("delay", "lag"), [(0.013, 0.0), (0.06, 0.0), (0.137, 0.0), (0.21, 0.0), (0.0, 0.02), (0.137, 0.04)]
+)
+def test_a_line_has_the_first_moment_of_what_arrives(delay: float, lag: float) -> None:
+    """So a speed moves as far as it does, and a position shows when. A lag answers the line, where a delay comes before it."""
+    fine, h = 4000, DT / SUBSTEPS
+    t = (np.arange(len(U) * SUBSTEPS * fine) + 0.5) * h / fine
+    given, keep = staircase(t - delay), np.exp(-h / fine / lag) if lag else 0.0
+    at = np.asarray(lfilter([1 - keep], [1, -keep], given, zi=[keep * given[0]])[0])
+    pieces = at.reshape(-1, fine)[LEAD * SUBSTEPS :]
+    place = (np.arange(fine) + 0.5) / fine - 0.5
+    out = delayed_inputs(jnp.asarray(U), jnp.array([delay]), jnp.array([lag]), dt=DT, substeps=SUBSTEPS, lead=LEAD)
+    line = np.asarray(out)[..., 0].reshape(-1, 3)
+    np.testing.assert_allclose(line[:, 1], pieces.mean(axis=1), atol=2e-3)
+    np.testing.assert_allclose(
+        line[:, 2] - line[:, 0], 12 * (pieces * place).mean(axis=1), atol=0.025 if delay and lag else 6e-3
+    )
+    np.testing.assert_allclose(line[:, 1], (line[:, 0] + line[:, 2]) / 2, rtol=1e-9)
+    assert np.abs(line[:, 2] - line[:, 0]).max() > 0.1
+
+
+def test_a_line_keeps_to_the_range_of_its_input_and_to_its_mean() -> None:
+    """Beyond it a root may not be defined; a value that was given is within."""
+    u = np.repeat([0.0, 1.0, 0.0, 0.4, 1.0, 0.0], 2)[:, None]
+    more = {"dt": DT, "substeps": 2, "lead": 2}
+    late = jnp.array([0.03]), jnp.array([0.0])
+    free = np.asarray(delayed_inputs(jnp.asarray(u), *late, **more))[..., 0]
+    kept = np.asarray(delayed_inputs(jnp.asarray(u), *late, **more, ranges=[(0.0, 0.9)]))[..., 0]
+    assert free.min() < -0.1
+    assert free.max() > 1.1
+    assert kept.min() >= -1e-12
+    assert kept.max() <= 1 + 1e-12
+    np.testing.assert_allclose(kept[:, :, 1], free[:, :, 1], rtol=1e-12)
+    np.testing.assert_allclose(kept[:, :, 0] + kept[:, :, 2], 2 * kept[:, :, 1], rtol=1e-12, atol=1e-12)
+    within = (free.min(axis=2) >= 0) & (free.max(axis=2) <= 1)
+    assert within.any()
+    np.testing.assert_allclose(kept[within], free[within], rtol=1e-12)
+
+
+def test_readings_go_by_the_mean_of_what_is_held() -> None:
+    u = np.concatenate([U, 0.5 * U], axis=1)
+    late = jnp.array([0.03, 0.0]), jnp.array([0.0, 0.0])
+    out = delayed_inputs(jnp.asarray(u), *late, dt=DT, substeps=SUBSTEPS, lead=LEAD, linear=(1,))
+    read = as_read(out, (1,))
+    np.testing.assert_array_equal(read[..., 1], out[..., 1])
+    np.testing.assert_array_equal(read[..., 0], jnp.broadcast_to(out[:, :, 1:2, 0], out.shape[:3]))
+    np.testing.assert_array_equal(as_read(out, ()), out[:, :, 1:2])
+    np.testing.assert_array_equal(as_read(out[0], (1,), 1), read[0])
 
 
 @pytest.mark.parametrize("at", [(0.137, 0.0), (0.06, 0.2), (0.313, 0.07)])
@@ -95,7 +146,7 @@ def test_a_play_comes_before_delay_and_lag() -> None:
         jnp.asarray(U), jnp.array([0.137]), jnp.array([0.2]), dt=DT, substeps=SUBSTEPS, lead=LEAD,
         half_play=jnp.array([0.4]),
     )  # fmt: skip
-    np.testing.assert_allclose(np.asarray(both)[:, :, 0, 0], arrived(0.137, 0.2, played(0.4)[:, None]), rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(both)[:, :, 1, 0], arrived(0.137, 0.2, played(0.4)[:, None]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("half", [0.0, 0.3])
@@ -115,10 +166,11 @@ def test_a_delay_of_whole_rows_is_that_however_it_is_compiled(rows: int) -> None
     late = jnp.full(2, rows * 0.1 / 3, jnp.float32)
 
     def arrived(u: jax.Array, delay: jax.Array) -> jax.Array:
-        return delayed_inputs(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0, :, 0]
+        return delayed_inputs(u, delay, jnp.zeros(2, jnp.float32), dt=dt, substeps=3, lead=3)[0]
 
     found = jax.jit(jax.vmap(arrived, in_axes=(0, None)))(inputs, late)
-    np.testing.assert_allclose(found, np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=5e-6)
+    for stage, most in ((0, 3e-5), (1, 5e-6), (2, 3e-5)):
+        np.testing.assert_allclose(found[:, :, stage], np.repeat(inputs[:, 3 - rows][:, None], 3, axis=1), atol=most)
 
 
 def driven(u: np.ndarray, slowness: float, *, linear: bool, fine: int = 4000) -> tuple[np.ndarray, np.ndarray]:
@@ -240,4 +292,4 @@ def test_every_word_is_a_place_on_the_way() -> None:
     asked = {w: delayed_inputs(jnp.asarray(U), *late, **more, linear=(0,), way=jnp.array([WAY[w]])) for w in WAY}
     np.testing.assert_allclose(asked["linear"], delayed_inputs(jnp.asarray(U), *late, **more, linear=(0,)), rtol=1e-9)
     held = delayed_inputs(jnp.asarray(U[:-1]), *late, **more)
-    np.testing.assert_allclose(asked["held"][:, :, 1:2], held, rtol=1e-9)
+    np.testing.assert_allclose(asked["held"], held, rtol=1e-9)

@@ -26,7 +26,7 @@ def may_be_late(augmented: Augmented) -> bool:
 def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[[Array, Array], Array]:
     """Return the map from parameters (dp, ...) and inputs (lead + T, nu, ...) to inputs of substeps (T, substeps, K, nu, ...).
 
-    K is 3, beginning, middle and end of a substep, where an input is not held between rows; else 1, its mean.
+    K is 3, beginning, middle and end of a substep, where an input is not held between rows or may be late; else 1.
 
     Args:
         augmented: model with candidates: its own delays and lags of inputs, and those of effects.
@@ -35,6 +35,7 @@ def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[
     """
     model = augmented.model
     nu, linear = len(model.inputs), moving_of(augmented)
+    ranges = [(q.low, q.high) for q in model.inputs]
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
     slow = augmented.operators[RATE_LIMIT]
     # where it is asked what an input does between rows, the way from held over linear to smooth says so
@@ -52,7 +53,17 @@ def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[
 
         def one(u: Array, delay: Array, lag: Array, more: dict[str, Array]) -> Array:
             return delayed_inputs(
-                u, delay, lag, dt=model.dt, substeps=substeps, lead=lead, linear=linear, smooth=model.smooth, **more
+                u,
+                delay,
+                lag,
+                dt=model.dt,
+                substeps=substeps,
+                lead=lead,
+                linear=linear,
+                smooth=model.smooth,
+                rising=may_be_late(augmented),
+                ranges=ranges,
+                **more,
             )
 
         return _over_points(one, p.ndim - 1)(u, *times, more)

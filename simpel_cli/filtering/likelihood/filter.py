@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.integrate import at_stages
 from simpel_cli.filtering.likelihood.arriving import arriving_inputs, may_be_late, moving_of, per_signal
 from simpel_cli.filtering.likelihood.augmented import Augmented
@@ -69,6 +70,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
         augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag,
         augmented.own_late, model.linear, model.smooth, augmented.remainders, substeps, lead,
+        tuple((q.low, q.high) for q in model.inputs),
     )  # fmt: skip
     if key not in _KEPT:
         name = hashlib.sha256(repr(key).encode()).hexdigest()
@@ -131,23 +133,23 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     def flow_with_slope(p: Array, x: Array, u: Array, sure: Array) -> tuple[tuple[Array, Array, Array, Array], Any]:
         """Return the state one row later, its derivative in the first state, and the rate there with its derivative.
 
-        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...), the
-        slopes of the rates there, and the rates.
+        Behind them: the states at the beginning, in the middle and at the end of every substep, (substeps, 3, nx, ...), and the
+        slopes of the rates there.
         """
 
-        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array, Array]]:
+        def stage(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
             (x, phi, total, total_phi, slope, slope_phi, _), (weights, u) = carry, now
             h, h_phi = length(u), length(u, 2)
             there = x + h * weights[0] * slope
             slope, rate_x = apart(sure, rates, there, u, p)
             slope_phi = apart(sure, product, rate_x, phi + h_phi * weights[0] * slope_phi)
             end, end_phi = total + h * weights[1] * slope, total_phi + h_phi * weights[1] * slope_phi
-            return (x, phi, end, end_phi, slope, slope_phi, rate_x), (there, rate_x, slope)
+            return (x, phi, end, end_phi, slope, slope_phi, rate_x), (there, rate_x)
 
         nothing = jnp.zeros_like(x), jnp.zeros((nx, *x.shape), x.dtype)
         unit = nothing[1] + along(jnp.eye(nx), x.ndim - 1)
 
-        def step(carry: Any, u: Array) -> tuple[Any, tuple[Array, Array, Array]]:
+        def step(carry: Any, u: Array) -> tuple[Any, tuple[Array, Array]]:
             x, phi, *_ = carry
             end, passed = in_stages(stage, (x, phi, x, phi, *nothing, nothing[1]), u)
             return (end[2], end[3], end[4], end[6]), jax.tree.map(lambda a: a[jnp.array([0, 2, 3])], passed)
@@ -174,10 +176,22 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         first, last = (plain_rates(x, end, p) for end in (u[0], u[-1]))
         return moving(rate, rate_x, (last - first) / length(u[0]))
 
-    def arrived(x: Array, u: Array, p: Array) -> Array:
-        """Return how the rates jump between the substeps of a row, (substeps - 1, nx, ...), at about this state."""
-        at = jax.vmap(lambda u: plain_rates(x, u, p))
-        return at(u[1:, 0]) - at(u[:-1, -1])
+    def shown(u: Array, axis: int) -> Array:
+        """Return inputs of substeps as readings go by them (`as_read`); axis: of K."""
+        return as_read(u, linear, axis)
+
+    def arrived(within: Array, last: Array, u: Array, p: Array) -> tuple[Array, Array]:
+        """Return how the rates jump between the substeps of a row, (substeps - 1, nx, ...), and what they are at its end.
+
+        Args:
+            within: (substeps - 1, nx, ...) states between them.
+            last: (nx, ...) at the end.
+            u: as readings go by it: in a step of the integrator the line of an input that arrives overshoots.
+            p: parameters.
+        """
+        points = jnp.concatenate([within, within, last[None]]), jnp.concatenate([u[1:, 0], u[:-1, -1], u[-1:, -1]])
+        rate = jax.vmap(lambda x, u: plain_rates(x, u, p))(*points)
+        return rate[: substeps - 1] - rate[substeps - 1 : -1], rate[-1]
 
     def seen(
         p: Array,
@@ -230,11 +244,12 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         def row(carry: tuple[Any, ...], data: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Track, Held]]:
             x, cov, u_before, motion, rate_x, jumps, begin = carry
             y_k, (ok_k, larger), u_k = data
-            predicted, predicted_cov, pace = x, cov, pace_of(u_k[0, 0], nu)
-            h_k, slope, prompt = seen(p, x, (u_before, u_k[0, 0]), motion, rate_x, jumps, begin, late)
+            acts = shown(u_k, 1)
+            predicted, predicted_cov, pace = x, cov, pace_of(acts[0, 0], nu)
+            h_k, slope, prompt = seen(p, x, (u_before, acts[0, 0]), motion, rate_x, jumps, begin, late)
             before = (motion, jumps) if late_ones else (None, None)
             if late_ones:
-                jumps = pushed(jumps, prompt, motion, moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p)))
+                jumps = pushed(jumps, prompt, motion, moving_in(p, x, acts[0], *rates(x, acts[0, 0], p)))
             off = wrapped(y_k - h_k)
             errors, variances, gains = [], [], []
             for j in range(ny):
@@ -245,23 +260,23 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
                 variances.append(s)
                 gains.append(gain)
             (following, jacobian, rate_after, rate_x_after), passed = flow_with_slope(p, x, u_k, sure)
-            stages, stage_x, stage_rate = passed
+            stages, stage_x = passed
             innovation, variance = jnp.stack(errors), jnp.stack(variances)
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
             held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, stages, stage_x, *before)
-            begin = () if pace is None else (x, rates(x, u_k[0, 0], p)[0], dt * pace)
-            motion = moving_in(p, following, u_k[-1], rate_after, rate_x_after)
+            begin = () if pace is None else (x, rates(x, acts[0, 0], p)[0], dt * pace)
+            if late_ones and parts > 1:
+                change, rate_after = arrived(stages[1:, 0], following, acts, p)
+            motion = moving_in(p, following, acts[-1], rate_after, rate_x_after)
             if late_ones:
-                begun = moving_in(p, x, u_k[0], *rates(x, u_k[0, 0], p))
+                begun = moving_in(p, x, acts[0], *rates(x, acts[0, 0], p))
                 motion = motion.since(begun, dt if pace is None else dt * pace[None])
                 if parts > 1:
-                    # where the last stage of a substep was is not quite its end
-                    ends = jax.vmap(applied)(stage_x[:-1, 2], stages[1:, 0] - stages[:-1, 2]) + stage_rate[:-1, 2]
-                    jumps = pushed_within(jumps, prompt, stage_rate[1:, 0] - ends, rate_x_after)
+                    jumps = pushed_within(jumps, prompt, change, rate_x_after)
             carry = (
                 following,
                 after(cov, jacobian, of_row(half, pace), sure),
-                u_k[-1, -1],
+                acts[-1, -1],
                 motion,
                 rate_x_after,
                 jumps,
@@ -269,9 +284,10 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             )
             return carry, (out, held)
 
-        first = u_sub[0, 0, 0]
+        begun_with = shown(u_sub[0], 1)[0]
+        first = begun_with[0]
         rate, rate_x = rates(start, first, p)
-        motion = moving_in(p, start, u_sub[0, 0], rate, rate_x)  # as if it had been going on so
+        motion = moving_in(p, start, begun_with, rate, rate_x)  # as if it had been going on so
         begin = (
             start,
             diagonal(spread),
@@ -291,6 +307,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return sensors(x, u, p)[0]
 
     def read(p: Array, x_before: Array, u_before: Array, x: Array, u: Array, jumps: Array) -> tuple[Array, Array]:
+        u_before, u = shown(u_before, 1), shown(u, 1)
         end = u_before[-1, -1]
         now, slope = at_row(lambda u: sensors(x, u, p), end, u[0, 0], nu)
         pace, early = pace_of(end, nu), early_of(u[0, 0], nu)
@@ -305,12 +322,13 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             going = moving_in(p, x, u[0], *rates(x, u[0, 0], p))
             jumps = pushed(jumps, slope, motion, going)
             if parts > 1:
-                change = arrived(x + substeps / 2 * length(u[0, 0]) * going.rate, u, p)
+                middle = x + substeps / 2 * length(u[0, 0]) * going.rate
+                change, _ = arrived(jnp.broadcast_to(middle, (substeps - 1, *middle.shape)), middle, u, p)
                 jumps = pushed_within(jumps, slope, change, rates(x, u[0, 0], p)[1])
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
-    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, bool(linear), parts)
+    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, linear, parts)
     return Filter(
         "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs,
         JUMPS * parts,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.late_readings import shares
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import chosen, early_of
@@ -34,7 +35,7 @@ class Timing(NamedTuple):
         inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu, ...).
         of_inputs: rows of p that say when an input arrives.
         late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
-        rising: whether inputs go straight from a row to the next.
+        linear: inputs that go straight from a row to the next.
         parts: of a row, between which an input may arrive.
     """
 
@@ -43,7 +44,7 @@ class Timing(NamedTuple):
     inputs: Callable[[Array, Array], Array]
     of_inputs: Sequence[int]
     late_by: Callable[[Array], tuple[Array, Array]] | None
-    rising: bool
+    linear: tuple[int, ...]
     parts: int
 
 
@@ -67,10 +68,12 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
                 return where_asked(ask, along, unit)
 
             moved = jnp.moveaxis(_of_each(arriving, (asked, units), _count(rows, p)), 1, 0)
-            moved_before = jnp.concatenate([moved[:1, :, 0, 0], moved[:-1, :, -1, -1]])
+            seen_moved = as_read(moved, timing.linear, 3)  # (T, D, substeps, K, nu, ...)
+            moved_before = jnp.concatenate([seen_moved[:1, :, 0, 0], seen_moved[:-1, :, -1, -1]])
         at_rows = lambda a: jnp.expand_dims(a, a.ndim - p.ndim + 1)  # noqa: E731
         late = None if late_by is None else jax.tree.map(at_rows, (late_by(p), _along(late_by, p, units)))
-        before = jnp.concatenate([held.u[:1, 0, 0], held.u[:-1, -1, -1]])[:, :nu]
+        acts = as_read(held.u, timing.linear, 2)
+        before = jnp.concatenate([acts[:1, 0, 0], acts[:-1, -1, -1]])[:, :nu]
 
         def of(part: tuple[Any, ...]) -> tuple[Ways, Pushes, Array | None]:
             """Rows are points like others: their axis goes in front of those of the points, and back."""
@@ -101,13 +104,16 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         """
         u = held.u[:, _stages_of(held.u.shape[1])]  # (substeps, 3, nu, ...)
         x_s, u_s = jnp.moveaxis(held.stages, 2, 0), jnp.moveaxis(u[:, :, :nu], 2, 0)
-        moved_s = None
+        acts = as_read(held.u, timing.linear, 1)[:, :, :nu]
+        moved_s = seen_moved = None
         if moved is not None:
             moved_s = jnp.moveaxis(moved[:, :, _stages_of(moved.shape[2])], 3, 1)
+            seen = as_read(moved, timing.linear, 2)
+            seen_moved = jnp.stack([seen[:, 0, 0], seen[:, -1, -1]], axis=2)  # (D, nu, 2, ...)
         by_x = jnp.moveaxis(held.stage_x, (2, 3), (0, 1))
         h = dt / substeps if held.pace is None else dt / substeps * held.pace[None]
         early = early_of(held.u[0, 0], nu)
-        begin = predicted, u_s[:, 0, 0]
+        begin = predicted, acts[0, 0]
         moves = late is not None or early is not None
         # what the rates are at the beginning of the row is asked among their stages: their program is a large one
         every_x, every_u = (_side_by_side(a, b if moves else None) for a, b in zip((x_s, u_s), begin, strict=True))
@@ -117,10 +123,13 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         if moves:
             first, now, end = by_x[:, :, 0, 0], _slopes(rates, p, *begin).by_x, by_x[:, :, -1, -1]
         then_of = None if early is None else _pushed(sensors, p, predicted, before, asked)
-        turned_of = None if bend is None else _pushed(bend, p, _ends(x_s), _ends(u_s), asked)
+        ends_u = jnp.stack([acts[0, 0], acts[-1, -1]], axis=1)
+        turned_of = None if bend is None else _pushed(bend, p, _ends(x_s), ends_u, asked)
+        held_ones = jnp.array([i for i in range(nu) if i not in timing.linear], int)
+        arrives = jnp.any(u_s[held_ones, :, 2] != u_s[held_ones, :, 0], axis=(0, 1))
         if late is not None:
             some_late = jnp.any(late[0][0] > 0) | jnp.any(late[0][1] > 0)
-            some_jump = jnp.any(held.u[1:, 0, :nu] != held.u[:-1, -1, :nu])
+            some_jump = jnp.any(acts[1:, 0] != acts[:-1, -1])
 
             rings = _rings(*late[0]) if timing.parts > 1 else None
 
@@ -130,10 +139,13 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             return smooth + still_shown(shares_of(*late, len(held.jumps), dt, timing.parts), held.jumps)
 
         def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
-            row, ask, moved, moved_before, slower = direction
-            at_first = None if moved is None else moved[:, 0, 0]
+            row, ask, moved, moved_ends, moved_before, slower = direction
+            at_first = None if moved_ends is None else moved_ends[:, 0]
             every = push_of(row, ask, None if moved is None else _side_by_side(moved, at_first if moves else None))
             push = every[:, : 3 * substeps].reshape(nx, substeps, 3, *every.shape[2:])
+            # at the ends of its line an input that arrives overshoots: in the middle it is its mean
+            mean = arrives if ask is None else arrives | ask
+            begins, ends = (jnp.where(mean, push[:, :, 1], push[:, :, k]) for k in (0, 2))
             reading = reading_of(row, ask, at_first)
             if then_of is not None and early is not None:
                 reading = chosen(early, then_of(row, ask, moved_before), reading)
@@ -143,25 +155,24 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
                 reading = reading + where_asked(asks, lambda d: jax.jvp(shown, (late[0],), (d,))[1], slower)
                 if rings is not None:
                     jumps = some_jump if ask is None else some_jump | ask
-                    change = jnp.moveaxis(push[:, 1:, 0] - push[:, :-1, 2], 1, 0)
+                    change = jnp.moveaxis(begins[:, 1:] - ends[:, :-1], 1, 0)
                     show = lambda change: _still_to_be_shown(rings, held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
                     within = where_asked(some_late & jumps, show, change)
             turn = bent = None
             if turned_of is not None:
-                ends = None if moved is None else _ends(moved)
-                turned = turned_of(row, ask, ends)
+                turned = turned_of(row, ask, moved_ends)
                 square = turned.reshape(nx, nx, *turned.shape[1:])
                 turn, bent = (square[:, :, 0] + square[:, :, 1]) / 2, None if early is None else square[:, :, 1]
             end = _composed(by_x, push, h, sure)
             if not moves:
                 return Pushes(end, reading, None, None, None, turn, bent), within
-            return Pushes(end, reading, push[:, 0, 0], every[:, -1], push[:, -1, -1], turn, bent), within
+            return Pushes(end, reading, begins[:, 0], every[:, -1], ends[:, -1], turn, bent), within
 
-        directions = (rows, asked, moved_s, moved_before, None if late is None else late[1])
+        directions = (rows, asked, moved_s, seen_moved, moved_before, None if late is None else late[1])
         found, within = _of_each(one, directions, _count(rows, p))
         turn = None
         if bend is not None:
-            turn = _slopes(bend, p, _ends(x_s), _ends(u_s)).by_x
+            turn = _slopes(bend, p, _ends(x_s), ends_u).by_x
             turn = turn.reshape(nx, nx, nx, *turn.shape[2:])
         return Ways(first, now, end, turn), found, within
 

@@ -200,7 +200,7 @@ def slopes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Array
 
         What a push adds to the rates' rates beside inputs that rise is by how much it grows in the row; else it is held.
         """
-        if not (timing.rising and push is not None and push.first is not None):
+        if not (timing.linear and push is not None and push.first is not None):
             return moving(rate, rate_x)
         step = dt if pace is None else dt * pace[None]
         return moving(rate, rate_x, (_there(push.end) - push.first) / step)
