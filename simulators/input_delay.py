@@ -7,7 +7,7 @@ import casadi
 
 from simulators.expression import Symbol
 from simulators.model import Model
-from simulators.quantity import Quantity
+from simulators.overshoot import reach
 
 
 class Arriving(NamedTuple):
@@ -60,13 +60,13 @@ def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Arriving]:
             return value
         return p[names.index(value)] if value in names else model.fixed[value]
 
-    each = []
+    each, ranges = [], reach(model)
     for i, q in enumerate(model.inputs):
         late = seconds(model.delay.get(q.name, 0.0)) / model.dt
         values = [row[i] for row in rows]
         line = _linear([*values, following[i]], late, model) if i in following else _held(values, late, model)
         line = _lagged(line, seconds(model.lag[q.name]), model) if q.name in model.lag else line
-        each.append(line if i in following else _within(line, q, values))
+        each.append(line if i in following else _within(line, ranges[i], values))
     last = [line[-model.substeps :] for line in each]
     return [
         Arriving(casadi.vertcat(*(line[s][0] for line in last)), casadi.vertcat(*(line[s][1] for line in last)), linear)
@@ -85,9 +85,9 @@ def _held(rows: Sequence[Symbol], late: Symbol, model: Model) -> Line:
     return _weighed(rows, [[_box(past - j + s / n - late, 1 / n) for j in range(past + 1)] for s in range(n)], past)
 
 
-def _within(line: Line, q: Quantity, given: Sequence[Symbol]) -> Line:
-    """Return a line that keeps to the range of its input, or to what was given beyond that; its mean stays."""
-    low, high = q.low, q.high
+def _within(line: Line, ends: tuple[Symbol, Symbol], given: Sequence[Symbol]) -> Line:
+    """Return a line that keeps to the range of its input (`reach`), or to what was given beyond that; its mean stays."""
+    low, high = ends
     for value in given:
         low, high = casadi.fmin(low, value), casadi.fmax(high, value)
     found = []

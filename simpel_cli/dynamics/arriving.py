@@ -25,13 +25,17 @@ def values_of(
 
 
 def arriving(
-    model: Model, rows: Float[Array, "R du"], phi: Float[Array, " dp"], lead: int
+    model: Model,
+    rows: Float[Array, "R du"],
+    phi: Float[Array, " dp"],
+    lead: int,
+    ranges: Sequence[tuple[float, float]] = (),
 ) -> Float[Array, "T substeps K du"]:
-    """Return the inputs of every substep of the rows behind the lead (see `delayed_inputs`)."""
+    """Return the inputs of every substep of the rows behind the lead; ranges: as of `delayed_inputs`."""
     late = seconds(model, model.delay, phi), seconds(model, model.lag, phi)
     return delayed_inputs(
         rows, *late, dt=model.dt, substeps=model.substeps, lead=lead, linear=model.linear,
-        ranges=[(q.low, q.high) for q in model.inputs],
+        ranges=ranges,
     )  # fmt: skip
 
 

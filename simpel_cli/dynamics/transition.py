@@ -24,6 +24,7 @@ from simpel_cli.dynamics.late_readings import late_of
 from simpel_cli.errors import ConfigError
 from simulators.groups import slots_of
 from simulators.model import Model, Quantity
+from simulators.overshoot import reach
 from simulators.worlds.world import World
 
 LONG = 200  # scalar instructions of a right-hand side that is compiled once and not once per stage
@@ -86,13 +87,14 @@ def transition(model: Model, encoding: Encoding) -> Transition:
             f"inputs before its own. Use data.stack_actions={needed}."
         )
     late_inputs = bool(model.delay or model.lag)
+    kept = reach(model) if late_inputs else ()
     late = late_of(model, measure) if measure is not None else None
     before = max(echoes, int(late is not None))
 
     def acting_of(u: Float[Array, "R du"], phi: Float[Array, " dp"]) -> Float[Array, "T substeps K du"]:
         """Return the inputs of the substeps of the row in question and, where sensors are late, of those before."""
         if late_inputs:
-            return arriving(model, u, phi, encoding.stack - before)
+            return arriving(model, u, phi, encoding.stack - before, kept)
         first = [max(encoding.stack - k, 0) for k in range(before, -1, -1)]  # without inputs no past is needed
         return jnp.stack([prompt_inputs(u[k : k + 2], model.substeps, model.linear) for k in first])
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from simpel_cli.dynamics.arriving import arriving
+from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.casadi_jax import to_jax
 from simpel_cli.dynamics.late_readings import behind, late_of
 from simpel_cli.dynamics.transition import encoding_of, transition
@@ -145,7 +146,7 @@ def test_an_input_that_arrives_within_a_row_jumps_there(late: float) -> None:
     of_halves = late_of(fine, to_jax(fine.function()))
     assert of_rows is not None
     assert of_halves is not None
-    now = arriving(rows, u[:, None], jnp.zeros(0), 2)
+    now = as_read(arriving(rows, u[:, None], jnp.zeros(0), 2), rows.linear)
     found = of_rows.behind(x, now, jnp.zeros(0))
     expected = of_halves.behind(x, jnp.broadcast_to(halves[:, None, None, None], (len(halves), 4, 1, 1)), jnp.zeros(0))
     np.testing.assert_allclose(found, expected, rtol=1e-6)

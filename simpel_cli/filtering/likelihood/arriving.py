@@ -10,6 +10,7 @@ from simpel_cli.dynamics.between_rows import WAY, beyond
 from simpel_cli.dynamics.input_delay import delayed_inputs
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simulators.effects.term import BACKLASH, BETWEEN_ROWS, DELAY, LAG, ON_INPUT, RATE_LIMIT
+from simulators.overshoot import reach
 
 
 def moving_of(augmented: Augmented) -> tuple[int, ...]:
@@ -35,7 +36,7 @@ def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[
     """
     model = augmented.model
     nu, linear = len(model.inputs), moving_of(augmented)
-    ranges = [(q.low, q.high) for q in model.inputs]
+    ranges = reach(model) if may_be_late(augmented) else ()
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
     slow = augmented.operators[RATE_LIMIT]
     # where it is asked what an input does between rows, the way from held over linear to smooth says so

@@ -144,7 +144,9 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             every = push_of(row, ask, None if moved is None else _side_by_side(moved, at_first if moves else None))
             push = every[:, : 3 * substeps].reshape(nx, substeps, 3, *every.shape[2:])
             # at the ends of its line an input that arrives overshoots: in the middle it is its mean
-            mean = arrives if ask is None else arrives | ask
+            mean = arrives
+            if ask is not None and moved is not None:
+                mean = mean | (ask & jnp.any(moved[held_ones, :, 2] != moved[held_ones, :, 0], axis=(0, 1)))
             begins, ends = (jnp.where(mean, push[:, :, 1], push[:, :, k]) for k in (0, 2))
             reading = reading_of(row, ask, at_first)
             if then_of is not None and early is not None:
