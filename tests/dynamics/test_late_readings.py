@@ -10,8 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 from simpel_cli.dynamics.arriving import arriving
-from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.casadi_jax import to_jax
+from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.late_readings import behind, late_of
 from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
