@@ -2,8 +2,18 @@
 
 import numpy as np
 import pytest
+import yaml
+from test_ranges import cart
 
+from simpel_cli.config.build import build
+from simpel_cli.config.folders import conf_dir
+from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.search.acceptance import _of_outliers
 from simpel_cli.discovery.search.gate.few_places import PLACES, REACH, in_few_places
+from simpel_cli.discovery.search.trials import Search
+from simpel_cli.filtering.errors_ahead import Assessor
+from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
+from simpel_cli.filtering.setup import setup
 
 ENOUGH = 20.0
 
@@ -40,3 +50,41 @@ def test_a_place_takes_the_rows_with_it_in_which_the_filter_comes_back() -> None
     assert in_few_places(found[:, ::-1], ENOUGH)
     found[0, :] = 0.5
     assert not in_few_places(found, 15.0)
+
+
+NOISE = 0.004
+
+
+def limited(top: float, *, outlier: bool) -> Recording:
+    """Carts whose speed is read up to a level, or too low where it is the largest of all, once."""
+    random, episodes = np.random.default_rng(8), []
+    for e in range(4):
+        u = np.repeat(random.uniform(-3, 3, 12), 5)
+        x = np.zeros((60, 2))
+        for i in range(59):
+            (s, v), a = x[i], 1.2 * u[i]
+            x[i + 1] = s + 0.1 * v + 0.005 * a, v + 0.1 * a
+        y = x + NOISE * random.normal(size=x.shape)
+        y[:, 1] = np.minimum(y[:, 1], top)
+        if outlier and e == 0:
+            *_, second, largest = np.argsort(y[:, 1])
+            y[largest, 1] = y[second, 1] + NOISE
+        episodes.append(Episode(str(e), np.arange(60) * 0.1, y, u[:, None], np.zeros((60, 0))))
+    every = {"s": NOISE, "v": NOISE}
+    return Recording(tuple(episodes[:3]), tuple(episodes[3:]), (), every, (), (Check("c", True, ""),), ())
+
+
+@pytest.mark.parametrize(("top", "outlier"), [(np.inf, True), (1.0, False)])
+def test_the_noise_does_not_hide_that_an_end_of_a_sensor_is_an_outlier(top: float, outlier: bool) -> None:
+    """Without it the noise is larger, so that every row gains a little by it."""
+    ends = build(yaml.safe_load((conf_dir() / "effect" / "sensor_saturation.yaml").read_text()), "effect")
+    recording = limited(top, outlier=outlier)
+    plan = setup(cart(), recording, (), [ends], 2)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=15))
+    (place,) = (t for t, term in enumerate(search.terms) if (term.effect, term.acts_on) == ("sensor_saturation", "v"))
+    base = search.base()
+    start, row = base.optimum.z.copy(), search.rows[place][0]
+    start[row] = plan.coordinates.unit(row, max(e.states[:, 1].max() for e in recording.train))
+    chosen = search.best((place,), search.fitter([Hypothesis(start, search.free((place,)), search.ones)]))
+    assert chosen.optimum.log_evidence > base.optimum.log_evidence + ENOUGH
+    assert _of_outliers(search, Assessor(plan, 5), chosen, base) is outlier

@@ -16,7 +16,7 @@ from simpel_cli.discovery.search.sets.forward import condensed, further, selecte
 from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, cut, refused
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.discovery.search.unexplained.interactions import interaction
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import ONE_STEP
@@ -178,6 +178,10 @@ def gated_selection(
                 grows = search.once(asked, partial(growing_for, search, assessor, chosen, part, use))
                 harmless = grows is not None and not grows
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
+            # of one episode in which it gains, resampling finds one that surely does
+            narrow = judged[i].passed and judged[i].low < ACCEPT
+            if narrow and _of_outliers(search, assessor, chosen, part):
+                judged[i] = judged[i]._replace(passed=False)
         failed = [i for i, found in enumerate(judged) if not found.passed]
         earned = {i: selection.gains[i] for i in failed if not judged[i].harm and selection.gains[i] > STRONG}
         acts = {i for i in earned if len(parts) > 1 and not _of_outliers(search, assessor, chosen, parts[i])}
@@ -208,8 +212,14 @@ def gated_selection(
 
 
 def _of_outliers(search: Search, assessor: Assessor, chosen: Trial, part: Trial) -> bool:
-    """Whether a model gains over another in a few places alone of the rows that both were fitted to."""
-    return in_few_places(_by_row(search, assessor, chosen) - _by_row(search, assessor, part), STRONG)
+    """Whether a model gains over another in a few places alone of the rows that both were fitted to.
+
+    Both with the noise of the first: that of the other makes up for an outlier, so that every row would gain a little.
+    """
+    z = part.optimum.z.copy()
+    z[list(search.noise)] = chosen.optimum.z[list(search.noise)]
+    same = Trial(part.terms, part.optimum._replace(z=z))
+    return in_few_places(_by_row(search, assessor, chosen) - _by_row(search, assessor, same), STRONG)
 
 
 def _by_row(search: Search, assessor: Assessor, trial: Trial) -> np.ndarray:
