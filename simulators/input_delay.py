@@ -9,6 +9,8 @@ from simulators.expression import Symbol
 from simulators.model import Model
 from simulators.overshoot import reach
 
+HAIR = 1e-15  # of the range of an input
+
 
 class Arriving(NamedTuple):
     """The inputs over one substep: a straight line with the same mean and the same first moment.
@@ -30,6 +32,8 @@ class Arriving(NamedTuple):
 
     def read(self) -> Symbol:
         """Return the inputs that what is read at the beginning goes by, (du, 1): of what is held the mean."""
+        if self.rise is None:
+            return self.mean
         begin = self.at(0.0)
         return casadi.vertcat(*((begin if i in self.linear else self.mean)[i] for i in range(self.mean.shape[0])))
 
@@ -65,11 +69,11 @@ def delayed_inputs(model: Model, u: Symbol, p: Symbol) -> list[Arriving]:
         late = seconds(model.delay.get(q.name, 0.0)) / model.dt
         values = [row[i] for row in rows]
         line = _linear([*values, following[i]], late, model) if i in following else _held(values, late, model)
-        line = _lagged(line, seconds(model.lag[q.name]), model) if q.name in model.lag else line
-        each.append(line if i in following else _within(line, ranges[i], values))
-    last = [line[-model.substeps :] for line in each]
+        line = (_lagged(line, seconds(model.lag[q.name]), model) if q.name in model.lag else line)[-model.substeps :]
+        late_one = q.name in model.delay or q.name in model.lag
+        each.append(_within(line, ranges[i], values) if late_one and i not in following else line)
     return [
-        Arriving(casadi.vertcat(*(line[s][0] for line in last)), casadi.vertcat(*(line[s][1] for line in last)), linear)
+        Arriving(casadi.vertcat(*(line[s][0] for line in each)), casadi.vertcat(*(line[s][1] for line in each)), linear)
         for s in range(model.substeps)
     ]  # fmt: skip
 
@@ -86,14 +90,19 @@ def _held(rows: Sequence[Symbol], late: Symbol, model: Model) -> Line:
 
 
 def _within(line: Line, ends: tuple[Symbol, Symbol], given: Sequence[Symbol]) -> Line:
-    """Return a line that keeps to the range of its input (`reach`), or to what was given beyond that; its mean stays."""
+    """Return a line that keeps to the range of its input (`reach`), or to what was given beyond that; its mean stays.
+
+    A hair within: not even what is rounded is beyond it.
+    """
     low, high = ends
     for value in given:
         low, high = casadi.fmin(low, value), casadi.fmax(high, value)
+    hair = HAIR * (high - low)
     found = []
     for mean, rise in line:
-        most = casadi.fmax(2 * casadi.fmin(mean - low, high - mean), 0.0)
-        found.append((mean, casadi.fmin(casadi.fmax(rise, -most), most)))
+        within = casadi.fmin(casadi.fmax(mean, low + hair), high - hair)
+        most = 2 * casadi.fmin(within - low, high - within) * (1 - HAIR)
+        found.append((within, casadi.fmin(casadi.fmax(rise, -most), most)))
     return found
 
 

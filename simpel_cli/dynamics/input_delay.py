@@ -50,8 +50,8 @@ def delayed_inputs(
         linear: inputs that move from a row to the next, straight where nothing else is said; the others are held.
         smooth: those of them that are smooth curves through their rows.
         way: from held (0) over linear (1/2) to smooth (1), per input, of those in `linear`; None: as the words say.
-        rising: whether a held input may arrive within a substep; else none is late.
-        ranges: that held inputs keep to, per input, where they were given no value beyond it; none: they may be anything.
+        rising: whether a held input may arrive within a substep; else it is held over it, at its mean.
+        ranges: that inputs keep to, per input, where they were given no value beyond it; none: they may be anything.
 
     Returns:
         The values at beginning, middle and end of every substep (K = 3) where an input is linear or may rise; else, K = 1, the
@@ -86,37 +86,38 @@ def delayed_inputs(
     def weighed(weight: Array, near: Array) -> Array:
         return jnp.dot(near, weight.T, precision=jax.lax.Precision.HIGHEST).reshape(-1)
 
-    def line(word: str, near: Array, passed: Array) -> tuple[Array, Array]:
+    def line(word: str, near: Array, passed: Array, *, rises: bool) -> tuple[Array, Array]:
         """Return mean and rise over every substep."""
         mean, rise = KERNELS[word].shares(passed)
         mean = weighed(_complete(mean, 1.0), near)  # later than all that is known: the oldest
-        rises = rising or word != HELD
         return mean, weighed(_complete(rise, 0.0), near) if rises else jnp.zeros_like(mean)
 
     def lagged(mean: Array, rise: Array, tau: Array) -> tuple[Array, Array]:
         """Return the exact answer of the lag to straight lines, as lines: mean and rise of every substep."""
-        ratio = dt / substeps / (tau + 1e-15 * dt / substeps)
-        keep = jnp.exp(-ratio)
-        settled = mean - rise / 2 - rise / ratio  # the particular solution at the beginning of a substep
+        slow = tau / (dt / substeps) + 1e-15  # in substeps; powers of its reciprocal have no derivative in float32
+        keep = jnp.exp(-1 / slow)
+        settled = mean - rise / 2 - rise * slow  # the particular solution at the beginning of a substep
 
         def join(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
             return a[0] * b[0], a[1] * b[0] + b[1]
 
         _, ends = jax.lax.associative_scan(join, (jnp.full_like(mean, keep), (1 - keep)[None] * settled + rise))
         first = mean[:1] - rise[:1] / 2  # settled before the record
-        ends = ends + jnp.exp(-ratio[None] * order) * first
+        ends = ends + jnp.exp(-order / slow[None]) * first
         begin = jnp.concatenate([first, ends[:-1]])
         fading = begin - settled
-        turn = 12 * ((1 - keep) / ratio**2 - (1 + keep) / (2 * ratio))  # rise of exp(-t/tau), by its first moment
-        return mean - rise / ratio + fading * ((1 - keep) / ratio)[None], rise + fading * turn[None]
+        turn = 12 * slow * ((1 - keep) * slow - (1 + keep) / 2)  # rise of exp(-t/tau), by its first moment
+        return mean - rise * slow + fading * ((1 - keep) * slow)[None], rise + fading * turn[None]
 
-    low, high = (_ends(u, [r[k] for r in ranges], k) for k in (0, 1))
+    low, high = (
+        jnp.repeat(_ends(near, [r[k] for r in ranges], k), substeps, axis=0) for k in (0, 1)
+    )  # of every substep
 
     def one_held(near: Array, d: Array, tau: Array, low: Array, high: Array) -> Array:
-        mean, rise = lagged(*line(HELD, near, back - d / dt), tau)
+        mean, rise = lagged(*line(HELD, near, back - d / dt, rises=rising), tau)
         if not rising:
             return mean[None]
-        if ranges:  # beyond it a root or a logarithm may not be defined
+        if ranges:
             most = jnp.maximum(2 * jnp.minimum(mean - low, high - mean), 0.0)
             rise = jnp.clip(rise, -most, most)
         return jnp.stack([mean + at * rise for at in STAGES])
@@ -128,7 +129,8 @@ def delayed_inputs(
             w = 2 * way[i]
             parts = {HELD: jnp.maximum(1 - w, 0.0), LINEAR: 1 - jnp.abs(w - 1), SMOOTH: jnp.maximum(w - 1, 0.0)}
         rows_of = {word: (near_curve if word == SMOOTH else near)[..., i] for word in parts}
-        lines = {word: line(word, rows_of[word], passed) for word in parts}
+        # while it is asked whether it is held, it is the mean: a line that overshoots would be taken for a straight input
+        lines = {word: line(word, rows_of[word], passed, rises=word != HELD) for word in parts}
         found = [sum((parts[word] * lines[word][k] for word in parts), jnp.zeros(())) for k in (0, 1)]
         mean, rise = lagged(found[0], found[1], tau)
         stages = jnp.stack([mean + at * rise for at in STAGES])
@@ -142,26 +144,28 @@ def delayed_inputs(
         return stages + parts[SMOOTH] * prompt * jnp.stack(off)
 
     if not linear:
-        every = jax.vmap(one_held, in_axes=(2, 0, 0, 0, 0), out_axes=2)(near, delay, lag, low, high)
+        every = jax.vmap(one_held, in_axes=(2, 0, 0, 1, 1), out_axes=2)(near, delay, lag, low, high)
     else:
         held = [i for i in range(u.shape[1]) if i not in linear]
-        columns = {i: one_held(near[..., i], delay[i], lag[i], low[i], high[i]) for i in held}
+        columns = {i: one_held(near[..., i], delay[i], lag[i], low[:, i], high[:, i]) for i in held}
         columns |= {i: one_moving(i, delay[i], lag[i]) for i in linear}
         shape = (len(STAGES), rows * substeps)
         every = jnp.stack([jnp.broadcast_to(columns[i], shape) for i in range(u.shape[1])], axis=2)
+    if ranges:  # beyond it a root or a logarithm may not be defined: not even by what was rounded
+        every = jnp.where(every < low[None], low[None], jnp.where(every > high[None], high[None], every))
     return jnp.moveaxis(every, 0, 1).reshape(rows, substeps, every.shape[0], -1)[lead:]
 
 
-def _ends(u: Array, declared: Sequence[float], side: int) -> Array:
-    """Return the lowest (0) or highest (1) value of every input, (nu,): as declared, or as given where that is beyond it."""
-    of = (jnp.min, jnp.max)[side](u, axis=0)
-    return (jnp.minimum, jnp.maximum)[side](of, jnp.array(declared, u.dtype)) if len(declared) else of
+def _ends(near: Array, declared: Sequence[float], side: int) -> Array:
+    """Return the lowest (0) or highest (1) value of the inputs near every row, (rows, nu): as declared, or given beyond it."""
+    of = (jnp.min, jnp.max)[side](near, axis=1)
+    return (jnp.minimum, jnp.maximum)[side](of, jnp.array(declared, near.dtype)[None]) if len(declared) else of
 
 
 def as_read(u: Array, linear: Sequence[int], axis: int = 2) -> Array:
     """Return inputs of substeps (.., K, nu, ..) as readings go by them: what is held is its mean over a substep.
 
-    K is 1 in the end where no input is linear.
+    What is returned has K = 1 where no input is linear.
 
     Args:
         u: as of `delayed_inputs`.

@@ -378,11 +378,15 @@ FIRST = 6  # rows of a test episode that tell its first state, as in `simpel dis
 def of_exam(out: Path, index: int) -> dict[str, Any] | None:
     """Return the errors of free runs of a set of an exam, linear and nonlinear, in those of `simpel discover`.
 
-    None: it was not run, has nothing planted, or episodes without some of their values.
+    None: it was not run, has nothing planted, a speed that was derived, or episodes without some of their values.
     """
     folder, path = out / "sets" / str(index), out / "truth" / f"{index}.json"
     verdict = folder / "run" / "verdict.json"
     if not verdict.exists() or not (truth := json.loads(path.read_text()))["effects"]:
+        return None
+    if (
+        truth["condition"] == "derived velocity"
+    ):  # a speed that is the difference of positions is no measurement of its own
         return None
     table = pd.read_parquet(folder / "data" / "run.parquet")
     table = table.drop(columns=[n for n in ("unit",) if n in table])

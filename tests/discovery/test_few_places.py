@@ -8,12 +8,16 @@ from test_ranges import cart
 from simpel_cli.config.build import build
 from simpel_cli.config.folders import conf_dir
 from simpel_cli.data.recording import Check, Episode, Recording
+from simpel_cli.discovery.search import acceptance
 from simpel_cli.discovery.search.acceptance import _of_outliers
 from simpel_cli.discovery.search.gate.few_places import PLACES, REACH, in_few_places
-from simpel_cli.discovery.search.trials import Search
+from simpel_cli.discovery.search.gate.held_out import Gate
+from simpel_cli.discovery.search.sets.selection import Selection
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Stage
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter, Hypothesis
 from simpel_cli.filtering.setup import setup
+from simpel_cli.runs.console import Terminal
 
 ENOUGH = 20.0
 
@@ -75,7 +79,9 @@ def limited(top: float, *, outlier: bool) -> Recording:
 
 
 @pytest.mark.parametrize(("top", "outlier"), [(np.inf, True), (1.0, False)])
-def test_the_noise_does_not_hide_that_an_end_of_a_sensor_is_an_outlier(top: float, outlier: bool) -> None:
+def test_the_noise_does_not_hide_that_an_end_of_a_sensor_is_an_outlier(
+    top: float, outlier: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without it the noise is larger, so that every row gains a little by it."""
     ends = build(yaml.safe_load((conf_dir() / "effect" / "sensor_saturation.yaml").read_text()), "effect")
     recording = limited(top, outlier=outlier)
@@ -87,4 +93,14 @@ def test_the_noise_does_not_hide_that_an_end_of_a_sensor_is_an_outlier(top: floa
     start[row] = plan.coordinates.unit(row, max(e.states[:, 1].max() for e in recording.train))
     chosen = search.best((place,), search.fitter([Hypothesis(start, search.free((place,)), search.ones)]))
     assert chosen.optimum.log_evidence > base.optimum.log_evidence + ENOUGH
-    assert _of_outliers(search, Assessor(plan, 5), chosen, base) is outlier
+    assessor = Assessor(plan, 5)
+    assert _of_outliers(search, assessor, chosen, base) is outlier
+    gain = chosen.optimum.log_evidence - base.optimum.log_evidence
+    selection = Selection(base, chosen, (base, chosen), (), (Stage(base, (chosen,)),), (gain,), None)
+    for low, passes in ((0.1, not outlier), (ACCEPT, True)):
+        gate = Gate(47.0, low, 139.0, "episode", harm=False, passed=True)
+        monkeypatch.setattr(acceptance, "gates", lambda *_, gate=gate: [gate])
+        search._answers.clear()
+        left, gates, _ = acceptance.gated_selection(search, assessor, selection, Terminal(quiet=True))
+        assert left.chosen.terms == ((place,) if passes else ())
+        assert gates == ([gate] if passes else [])

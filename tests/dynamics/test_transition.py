@@ -13,6 +13,7 @@ from simpel_cli.dynamics.transition import encoding_of, transition
 from simpel_cli.errors import ConfigError
 from simulators.model import Declared, Model
 from simulators.parameters import draw
+from simulators.step import one_step
 
 NOMINAL = {"m": 1.0, "l": 1.0, "C_m": 1.0}
 DRAG = {"c_1": 0.5, "c_2": 0.5}
@@ -144,3 +145,18 @@ def test_a_delay_needs_the_inputs_of_the_past() -> None:
     model = late(0.13, 0.0)
     with pytest.raises(ConfigError, match=r"data\.stack_actions: 1, but .* Use data\.stack_actions=2\."):
         transition(model, encoding_of(model, stack=1))
+
+
+@pytest.mark.parametrize("substeps", [1, 3, 4])
+def test_a_root_is_defined_where_a_late_input_keeps_to_its_range(substeps: int) -> None:
+    """Not even by what was rounded is it beyond: in a transition, and in the function that optimisers get."""
+    model = Declared(
+        "tank", dt=0.1, substeps=substeps, states={"h": {"unit": "m", "range": [0, 2]}},
+        inputs={"u": {"unit": "V", "range": [0, 1], "delay": 0.13}}, parameters={}, dynamics={"h": "sqrt(u) - h"},
+    ).model()  # fmt: skip
+    random, ahead, exported = np.random.default_rng(0), transition(model, encoding_of(model, stack=2)), one_step(model)
+    x = np.concatenate([random.uniform(0, 2, (60, 1)), random.choice([0.0, 0.3, 1.0], (60, 3))], axis=1)
+    found = np.asarray(jax.vmap(ahead.step, in_axes=(0, None))(jnp.asarray(x), jnp.zeros(0)))
+    assert np.isfinite(found).all()
+    expected = [float(exported(row[0], row[1:], [])[0]) - row[0] for row in x]
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-6)

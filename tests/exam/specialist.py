@@ -138,7 +138,7 @@ def tested(model: Model, at: np.ndarray) -> np.ndarray:
         first: Callable[[np.ndarray], np.ndarray] = lambda x, missed=missed: _finite(missed(x)[:FIRST])  # noqa: E731
         best = least_squares(first, np.zeros(len(size)), max_nfev=FITS).x
         errors.append(missed(best)[FIRST:] * model.made.noise[model.columns])
-    return np.sqrt(np.nanmean(np.concatenate(errors) ** 2, axis=0))
+    return np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
 
 
 def _spread(model: Model) -> np.ndarray:

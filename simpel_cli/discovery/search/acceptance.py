@@ -157,7 +157,8 @@ def gated_selection(
     that gains least on held-out episodes, and the others are judged without it: the harm may be its own. Of two that can stand
     for each other, neither of which gains for certain, the one with less evidence goes. Few held-out parts cannot tell of every
     member of a set whether it helps: one of strong evidence, of which they bear out a part, stays where the set surely helps,
-    unless its evidence comes from a few places of the recording, or an error is more likely than not to grow.
+    unless its evidence comes from a few places of the recording, or an error is more likely than not to grow. One that helps
+    for certain, but by less than an effect has to earn, goes where it gains in a few places: one outlier is enough for that.
     And where others fall with one that was not certain, and gains in more places, they stay together if together they
     surely help beside what is left: an overflow may do harm without the outflow that belongs to it.
     Where a use is named, harm is what is left of it with both models calibrated for that.
@@ -179,7 +180,7 @@ def gated_selection(
                 harmless = grows is not None and not grows
                 judged[i] = found._replace(harm=not harmless, passed=harmless, grows=() if harmless else found.grows)
             # of one episode in which it gains, resampling finds one that surely does
-            narrow = judged[i].passed and judged[i].low < ACCEPT
+            narrow = judged[i].passed and 0 < judged[i].low < ACCEPT
             if narrow and _of_outliers(search, assessor, chosen, part):
                 judged[i] = judged[i]._replace(passed=False)
         failed = [i for i, found in enumerate(judged) if not found.passed]

@@ -24,6 +24,12 @@ def may_be_late(augmented: Augmented) -> bool:
     return any(late) or any(augmented.own_delay) or any(augmented.own_lag)
 
 
+def may_arrive(augmented: Augmented) -> bool:
+    """Whether a held input may arrive within a row: late, or slowly."""
+    late = (augmented.operators[kind] for kind in (DELAY, LAG))
+    return any(late) or any(augmented.own_delay) or any(augmented.own_lag)
+
+
 def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[[Array, Array], Array]:
     """Return the map from parameters (dp, ...) and inputs (lead + T, nu, ...) to inputs of substeps (T, substeps, K, nu, ...).
 
@@ -36,7 +42,7 @@ def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[
     """
     model = augmented.model
     nu, linear = len(model.inputs), moving_of(augmented)
-    ranges = reach(model) if may_be_late(augmented) else ()
+    ranges = reach(model) if may_arrive(augmented) else ()
     delays, lags, plays, shares = (augmented.operators[kind] for kind in (DELAY, LAG, BACKLASH, BETWEEN_ROWS))
     slow = augmented.operators[RATE_LIMIT]
     # where it is asked what an input does between rows, the way from held over linear to smooth says so
@@ -62,7 +68,7 @@ def arriving_inputs(augmented: Augmented, substeps: int, lead: int) -> Callable[
                 lead=lead,
                 linear=linear,
                 smooth=model.smooth,
-                rising=may_be_late(augmented),
+                rising=may_arrive(augmented),
                 ranges=ranges,
                 **more,
             )

@@ -28,7 +28,13 @@ from jaxtyping import Array
 
 from simpel_cli.dynamics.input_delay import as_read
 from simpel_cli.dynamics.integrate import at_stages
-from simpel_cli.filtering.likelihood.arriving import arriving_inputs, may_be_late, moving_of, per_signal
+from simpel_cli.filtering.likelihood.arriving import (
+    arriving_inputs,
+    may_arrive,
+    may_be_late,
+    moving_of,
+    per_signal,
+)
 from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.clock import at_row, early_of, pace_of
 from simpel_cli.filtering.likelihood.covariances import after, counted, diagonal, of_half_a_row, of_row
@@ -50,6 +56,7 @@ from simpel_cli.filtering.likelihood.small_matrices import along, apart, applied
 from simpel_cli.filtering.likelihood.tangents import slopes_of
 from simpel_cli.filtering.likelihood.track import Filter, Held, Noise, Track
 from simulators.effects.term import ON_INPUT, SENSOR_DELAY, SENSOR_LAG
+from simulators.overshoot import reach
 
 _KEPT: OrderedDict[tuple, Filter] = OrderedDict()
 MOST_KEPT = (
@@ -70,7 +77,7 @@ def filter_of(augmented: Augmented, *, substeps: int, lead: int) -> Filter:
         augmented.function.serialize(), model.dt, tuple(q.periodic for q in model.states), tuple(q.name for q in model.states),
         augmented.measured, tuple(sorted(augmented.operators.items())), augmented.own_delay, augmented.own_lag,
         augmented.own_late, model.linear, model.smooth, augmented.remainders, substeps, lead,
-        tuple((q.low, q.high) for q in model.inputs),
+        reach(model) if may_arrive(augmented) else (),
     )  # fmt: skip
     if key not in _KEPT:
         name = hashlib.sha256(repr(key).encode()).hexdigest()

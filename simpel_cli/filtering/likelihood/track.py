@@ -94,7 +94,7 @@ class Filter(NamedTuple):
             each value may have been measured before it, and the jumps of its motion before the next row, which
             late sensors still show: (jumps, ORDERS, ny), 0 before the first row.
         delayed_inputs: (p, u) -> inputs as they arrive, (T, substeps, K, nu): held over a substep, or at its beginning, middle
-            and end; what stands behind the inputs, behind them.
+            and end (see `simpel_cli.dynamics.input_delay`); what stands behind the inputs, behind them.
         jumps: of the motion that late sensors may still show: of some rows, one for every step in which an input may arrive.
         remainders: rows of the state that are no part of a simulation (see `remainders.py`).
     """

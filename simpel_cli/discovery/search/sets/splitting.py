@@ -73,7 +73,7 @@ def _nearly_won(search: Search, chosen: Trial, own: int) -> list[int]:
     known = [(t, search.known.get(frozenset((*rest, t)))) for t in search.candidates(rest) if t != own]
     near = sorted(
         ((t, fit) for t, fit in known
-         if fit is not None and not search.terms[t].depends_on and 0 < best - fit.log_evidence < NEAR),
+         if fit is not None and not search.terms[t].depends_on and TIE < best - fit.log_evidence < NEAR),
         key=lambda found: -found[1].log_evidence,
     )  # fmt: skip
     apart: list[tuple[int, Optimum]] = []
