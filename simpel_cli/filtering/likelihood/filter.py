@@ -167,6 +167,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
     late_ones = bool(sensor_delays or sensor_lags or any(own_delays) or any(own_lags))
     # an input that is late itself makes a motion jump within a row
     parts = substeps if may_be_late(augmented) else 1
+    overshoots = may_arrive(augmented)  # at the ends of its line in a step
 
     def late_by(p: Array) -> tuple[Array, Array]:
         """Return delay d and lag tau of every sensor, (ny, ...)."""
@@ -272,7 +273,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
             out = Track(innovation, variance, predicted, predicted_cov, x, cov, jacobian, slope)
             held = Held(jnp.stack(gains), prompt, rate_x, pace, u_k, stages, stage_x, *before)
             begin = () if pace is None else (x, rates(x, acts[0, 0], p)[0], dt * pace)
-            if late_ones and parts > 1:
+            if (late_ones and parts > 1) or (overshoots and (late_ones or pace is not None)):
                 change, rate_after = arrived(stages[1:, 0], following, acts, p)
             motion = moving_in(p, following, acts[-1], rate_after, rate_x_after)
             if late_ones:

@@ -115,8 +115,14 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         early = early_of(held.u[0, 0], nu)
         begin = predicted, acts[0, 0]
         moves = late is not None or early is not None
-        # what the rates are at the beginning of the row is asked among their stages: their program is a large one
-        every_x, every_u = (_side_by_side(a, b if moves else None) for a, b in zip((x_s, u_s), begin, strict=True))
+        # what the rates are at both ends of the row is asked among their stages: their program is a large one. At the ends of
+        # its line an input that arrives overshoots
+        at_ends = (
+            jnp.stack([predicted, x_s[:, 0, 0], x_s[:, -1, -1]], axis=1),
+            acts[jnp.array([0, 0, -1]), jnp.array([0, 0, -1])],
+        )
+        at_ends = at_ends[0], jnp.moveaxis(at_ends[1], 1, 0)
+        every_x, every_u = (_side_by_side(a, b if moves else None) for a, b in zip((x_s, u_s), at_ends, strict=True))
         push_of = _pushed(rates, p, every_x, every_u, asked)
         reading_of = _pushed(sensors, p, *begin, asked)
         first = now = end = None
@@ -141,13 +147,9 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
             row, ask, moved, moved_ends, moved_before, slower = direction
             at_first = None if moved_ends is None else moved_ends[:, 0]
-            every = push_of(row, ask, None if moved is None else _side_by_side(moved, at_first if moves else None))
+            also = None if moved_ends is None or not moves else moved_ends[:, jnp.array([0, 0, 1])]
+            every = push_of(row, ask, None if moved is None else _side_by_side(moved, also))
             push = every[:, : 3 * substeps].reshape(nx, substeps, 3, *every.shape[2:])
-            # at the ends of its line an input that arrives overshoots: in the middle it is its mean
-            mean = arrives
-            if ask is not None and moved is not None:
-                mean = mean | (ask & jnp.any(moved[held_ones, :, 2] != moved[held_ones, :, 0], axis=(0, 1)))
-            begins, ends = (jnp.where(mean, push[:, :, 1], push[:, :, k]) for k in (0, 2))
             reading = reading_of(row, ask, at_first)
             if then_of is not None and early is not None:
                 reading = chosen(early, then_of(row, ask, moved_before), reading)
@@ -157,6 +159,11 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
                 reading = reading + where_asked(asks, lambda d: jax.jvp(shown, (late[0],), (d,))[1], slower)
                 if rings is not None:
                     jumps = some_jump if ask is None else some_jump | ask
+                    # in the middle of its line an input that arrives is its mean
+                    mean = arrives
+                    if ask is not None and moved is not None:
+                        mean = mean | (ask & jnp.any(moved[held_ones, :, 2] != moved[held_ones, :, 0], axis=(0, 1)))
+                    begins, ends = (jnp.where(mean, push[:, :, 1], push[:, :, k]) for k in (0, 2))
                     change = jnp.moveaxis(begins[:, 1:] - ends[:, :-1], 1, 0)
                     show = lambda change: _still_to_be_shown(rings, held.prompt, change, by_x[:, :, -1, -1])  # noqa: E731
                     within = where_asked(some_late & jumps, show, change)
@@ -168,7 +175,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             end = _composed(by_x, push, h, sure)
             if not moves:
                 return Pushes(end, reading, None, None, None, turn, bent), within
-            return Pushes(end, reading, begins[:, 0], every[:, -1], ends[:, -1], turn, bent), within
+            now_push, first_push, end_push = (every[:, k] for k in (-3, -2, -1))
+            return Pushes(end, reading, first_push, now_push, end_push, turn, bent), within
 
         directions = (rows, asked, moved_s, seen_moved, moved_before, None if late is None else late[1])
         found, within = _of_each(one, directions, _count(rows, p))
@@ -297,11 +305,11 @@ def _stages_of(count: int) -> Array:
     return jnp.array([0, count // 2, count - 1])
 
 
-def _side_by_side(stages: Array, one: Array | None) -> Array:
-    """Return the stages of a row, (n, substeps, 3, ...), one after the other, and one more point behind them, (n, ...)."""
+def _side_by_side(stages: Array, more: Array | None) -> Array:
+    """Return the stages of a row, (n, substeps, 3, ...), one after the other, and more points behind them, (n, k, ...)."""
     # n is 0 where there are no inputs: the size is said
     flat = stages.reshape(stages.shape[0], stages.shape[1] * stages.shape[2], *stages.shape[3:])
-    return flat if one is None else jnp.concatenate([flat, one[:, None]], axis=1)
+    return flat if more is None else jnp.concatenate([flat, more], axis=1)
 
 
 def _ends(a: Array) -> Array:
