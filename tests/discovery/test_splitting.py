@@ -111,6 +111,19 @@ def test_what_nearly_won_may_be_one_of_two_effects(noise: float, nearly: bool) -
     assert names(two_in_place(search, leaning, 0)) == ([["load", "spring"]] if nearly else [])
 
 
+def test_ties_take_no_place_of_what_nearly_won() -> None:
+    """Nats behind: two ties, what nearly won, one that is the same to the data, and one that is too far."""
+    behind = {1: 0.5, 2: 2.0, 3: 4.0, 4: 4.5, 5: 5.0, 6: 7.5}
+    losses = {1: 1.0, 2: 2.0, 3: 3.0, 4: 3.5, 5: 9.0, 6: 9.9}
+    fits: dict[int, Any] = {t: SimpleNamespace(log_evidence=-nats, loss=losses[t]) for t, nats in behind.items()}
+    chosen: Any = SimpleNamespace(terms=(0,), optimum=SimpleNamespace(log_evidence=0.0, loss=0.0))
+    search: Any = SimpleNamespace(
+        known={frozenset({t}): fit for t, fit in fits.items()}, candidates=lambda _: list(range(7)),
+        terms=[SimpleNamespace(depends_on=())] * 7,
+    )  # fmt: skip
+    assert unwrap(splitting._nearly_won)(search, chosen, 0) == [3, 5]
+
+
 @pytest.mark.parametrize(
     ("pairs", "said"),
     [

@@ -19,6 +19,7 @@ from simpel_cli.filtering.likelihood.track import Noise
 from simpel_cli.filtering.setup import setup
 from simulators.effects import Expression
 from simulators.model import Declared
+from simulators.overshoot import reach
 
 DT, ROWS, POINTS, STEP = 0.2, 16, 3, 1e-6
 # of the largest: k2 and k3 of a Runge-Kutta step share a state; where a sensor is late, the slope of the rates is held, too,
@@ -109,6 +110,19 @@ def test_derivatives_of_readings_are_those_of_differences(
         difference = np.asarray(read(jnp.asarray(p + unit)) - read(jnp.asarray(p - unit))) / (2 * STEP)
         assert np.abs(difference).max() > 1e-3  # it is seen
         np.testing.assert_allclose(found[k + 1], difference, atol=within * np.abs(difference).max())
+
+
+def test_filters_that_are_cut_at_different_ends_are_not_the_same() -> None:
+    """Where a root is defined beyond the range of an input depends on the ranges of the others."""
+    names = set()
+    for low, high in ((3.5, 5.0), (16.0, 18.0)):
+        parameters = {"k": {"unit": "1", "range": [low, high]}}
+        model = Declared(
+            "root", dt=DT, **PENDULUM | {"parameters": parameters, "dynamics": {"s": "v", "v": "sqrt(k + u)"}}
+        )
+        names.add((reach(model.model()), setup(model.model(), recording(["s", "v"], False), (), INPUTS, 2).rule.name))
+    assert len({ends for ends, _ in names}) == 2
+    assert len({name for _, name in names}) == 2
 
 
 @pytest.mark.parametrize("lanes", [None, 2])

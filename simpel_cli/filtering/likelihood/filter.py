@@ -336,7 +336,7 @@ def _filter_of(augmented: Augmented, substeps: int, lead: int) -> Filter:
         return now, jumps
 
     of_inputs = sorted({row for kind in ON_INPUT for _, row in augmented.operators[kind]})
-    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, linear, parts)
+    timing = Timing(dt, substeps, inputs, of_inputs, late_by if late_ones else None, linear, parts, overshoots)
     return Filter(
         "", track, pushes_of(augmented, timing), slopes_of(augmented, timing), flow, plain_measure, read, inputs,
         JUMPS * parts,

@@ -37,6 +37,7 @@ class Timing(NamedTuple):
         late_by: p -> delay and lag of every sensor, (ny, ...) each; None: no sensor is late.
         linear: inputs that go straight from a row to the next.
         parts: of a row, between which an input may arrive.
+        overshoots: whether a held input may arrive within one of them.
     """
 
     dt: float
@@ -46,6 +47,7 @@ class Timing(NamedTuple):
     late_by: Callable[[Array], tuple[Array, Array]] | None
     linear: tuple[int, ...]
     parts: int
+    overshoots: bool
 
 
 def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways, Pushes]]:
@@ -115,14 +117,13 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         early = early_of(held.u[0, 0], nu)
         begin = predicted, acts[0, 0]
         moves = late is not None or early is not None
-        # what the rates are at both ends of the row is asked among their stages: their program is a large one. At the ends of
-        # its line an input that arrives overshoots
-        at_ends = (
-            jnp.stack([predicted, x_s[:, 0, 0], x_s[:, -1, -1]], axis=1),
-            acts[jnp.array([0, 0, -1]), jnp.array([0, 0, -1])],
+        # what the rates are at the beginning of the row is asked among their stages: their program is a large one. So is what
+        # they are at both ends where, as a stage, the line of an input that arrives overshoots
+        also = [begin, *([(x_s[:, 0, 0], acts[0, 0]), (x_s[:, -1, -1], acts[-1, -1])] if timing.overshoots else [])]
+        every_x, every_u = (
+            _side_by_side(a, jnp.stack(points, axis=1) if moves else None)
+            for a, points in zip((x_s, u_s), zip(*also, strict=True), strict=True)
         )
-        at_ends = at_ends[0], jnp.moveaxis(at_ends[1], 1, 0)
-        every_x, every_u = (_side_by_side(a, b if moves else None) for a, b in zip((x_s, u_s), at_ends, strict=True))
         push_of = _pushed(rates, p, every_x, every_u, asked)
         reading_of = _pushed(sensors, p, *begin, asked)
         first = now = end = None
@@ -147,8 +148,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
         def one(direction: tuple[Any, ...]) -> tuple[Pushes, Array | None]:
             row, ask, moved, moved_ends, moved_before, slower = direction
             at_first = None if moved_ends is None else moved_ends[:, 0]
-            also = None if moved_ends is None or not moves else moved_ends[:, jnp.array([0, 0, 1])]
-            every = push_of(row, ask, None if moved is None else _side_by_side(moved, also))
+            along = None if moved_ends is None or not moves else moved_ends[:, jnp.array([0, 0, 1][: len(also)])]
+            every = push_of(row, ask, None if moved is None else _side_by_side(moved, along))
             push = every[:, : 3 * substeps].reshape(nx, substeps, 3, *every.shape[2:])
             reading = reading_of(row, ask, at_first)
             if then_of is not None and early is not None:
@@ -175,8 +176,8 @@ def pushes_of(augmented: Augmented, timing: Timing) -> Callable[..., tuple[Ways,
             end = _composed(by_x, push, h, sure)
             if not moves:
                 return Pushes(end, reading, None, None, None, turn, bent), within
-            now_push, first_push, end_push = (every[:, k] for k in (-3, -2, -1))
-            return Pushes(end, reading, first_push, now_push, end_push, turn, bent), within
+            outer = (every[:, -2], every[:, -1]) if timing.overshoots else (push[:, 0, 0], push[:, -1, -1])
+            return Pushes(end, reading, outer[0], every[:, 3 * substeps], outer[1], turn, bent), within
 
         directions = (rows, asked, moved_s, seen_moved, moved_before, None if late is None else late[1])
         found, within = _of_each(one, directions, _count(rows, p))
