@@ -18,6 +18,7 @@ from simpel_cli.discovery.search.gate.held_out import (
     RUNAWAY,
     _blocks,
     _judged,
+    _refitted,
     _tempered,
     gates,
     growing,
@@ -190,7 +191,7 @@ def test_an_effect_is_judged_on_every_window_that_had_no_part_in_its_parameters(
     search: Any = searched("b")
     windows, spare = windows_of(episode, 0), windows_of([0] * 5 + [1] * 3, 100)
     search.plan = search.plan._replace(windows=windows, spare=spare)
-    search.fitter, assessor = Fits(search.noise, windows), Likelihoods()
+    search.fitter, search.loud, assessor = Fits(search.noise, windows), lambda z: z, Likelihoods()
     trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(3)]
     first, second = gates(search, assessor, trials[0], trials[1:])
     assert sorted(set(assessor.seen)) == held_out
@@ -214,10 +215,24 @@ def test_a_single_window_cannot_be_held_out() -> None:
     search: Any = searched("b")
     windows = windows_of([0], 0)
     search.plan = search.plan._replace(windows=windows, spare=None)
-    search.fitter = Fits(search.noise, windows)
+    search.fitter, search.loud = Fits(search.noise, windows), lambda z: z
     trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(2)]
     (judged,) = gates(search, Likelihoods(), trials[0], trials[1:])
     assert not judged.passed
+
+
+def test_without_some_rows_the_better_of_two_optima_counts() -> None:
+    """The first model is in a poor optimum where it stands, the second with loud noise; the third begins in one place."""
+    worth, asked = {0.1: 1.0, 0.2: 9.0, 0.5: 5.0, 0.7: 3.0}, list[float]()
+
+    def fitter(hypotheses: Sequence[Hypothesis]) -> list[Optimum]:
+        asked.extend(float(h.z[0]) for h in hypotheses)
+        return [optimum(h.z)._replace(log_evidence=worth[float(h.z[0])]) for h in hypotheses]
+
+    begun = [Hypothesis(np.array([z]), (0,), np.ones(1)) for z in (0.1, 0.2, 0.7)]
+    found = _refitted(lambda z: np.maximum(z, 0.5), fitter, begun)
+    assert [o.log_evidence for o in found] == [5.0, 9.0, 3.0]
+    assert asked == [0.1, 0.2, 0.7, 0.5, 0.5]
 
 
 def test_blocks_of_a_short_record_cover_it_once() -> None:

@@ -3,7 +3,7 @@
 On a real rig, evidence alone named a friction with +79 nats while the held-out fit got worse: the gate is mandatory.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ TOLERATED = {"one_step": 0.1, "ahead": 0.02, "free": 0.02}  # of an error: so mu
 SURE = 0.025  # chance that an error which does not grow is said to, over all channels and horizons together
 RUNAWAY = 1e4  # nats that a window costs a model that ran away in it
 
+Fits = Callable[[Sequence[Hypothesis]], Sequence[Optimum]]
+Loud = Callable[[np.ndarray], np.ndarray]  # a start -> one with loud noise
 Errors = Mapping[str, np.ndarray]  # by horizon, in words: (W, T, ny)
 
 
@@ -88,7 +90,7 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     alone = enough or len(order) == 1
     folds = [] if alone else [np.isin(groups, p) for p in np.array_split(order, min(MOST_FOLDS, len(order)))]
     hypotheses = [Hypothesis(t.optimum.z, t.optimum.free, 1.0 - out) for out in folds for t in trials]
-    found = search.fitter(hypotheses)
+    found = _refitted(search.loud, search.fitter, hypotheses)
     # how loud the noise is says nothing about the effect: all models fit it anew on what was held out. What a group is that
     # was held out as a whole, only its own rows can tell, at the price that its population asks
     unseen = [_unseen(search, h.free, windows, h.weight > 0) for h in hypotheses]
@@ -125,6 +127,21 @@ def gates(search: Search, assessor: Assessor, whole: Trial, parts: Sequence[Tria
     ]
 
 
+def _refitted(loud: Loud, fitter: Fits, hypotheses: Sequence[Hypothesis]) -> list[Optimum]:
+    """Fit models to a part of the rows, each from where it stands on all of them and from there with loud noise.
+
+    Without some rows another optimum may be the best by a hundred nats: which one a fit comes to must not hang on where its
+    first step happens to lead.
+    """
+    begun = [hypothesis._replace(z=loud(hypothesis.z)) for hypothesis in hypotheses]
+    other = [i for i, (a, b) in enumerate(zip(hypotheses, begun, strict=True)) if not np.array_equal(a.z, b.z)]
+    found = fitter([*hypotheses, *(begun[i] for i in other)])
+    best = [*found[: len(hypotheses)]]
+    for i, optimum in zip(other, found[len(hypotheses) :], strict=True):
+        best[i] = max(best[i], optimum, key=lambda o: o.log_evidence)
+    return best
+
+
 def _of_blocks(
     search: Search, assessor: Assessor, trials: Sequence[Trial], blocks: np.ndarray
 ) -> tuple[list[np.ndarray], list[Errors], np.ndarray]:
@@ -143,7 +160,7 @@ def _of_blocks(
     for k in range(MOST_FOLDS):
         out = blocks[fold == k].any(axis=0)
         fitter = search.fitter.on(windows._replace(ok=np.where(out[..., None], 0.0, windows.ok)))
-        fits = fitter([Hypothesis(t.optimum.z, t.optimum.free, search.ones) for t in trials])
+        fits = _refitted(search.loud, fitter, [Hypothesis(t.optimum.z, t.optimum.free, search.ones) for t in trials])
         for i, fitted in enumerate(fits):
             found = assessor(fitted.z, windows)
             scores = score(found, windows)
