@@ -61,6 +61,7 @@ def write_posterior(into: Path, folder: Path, declared: Declared, index: int) ->
         "outputs": [{"name": q.name, "unit": q.unit} for q in encoding.outputs],
         "past_inputs": encoding.stack,
         "next_inputs": [encoding.inputs[i].name for i in encoding.linear],
+        "activation": method.network.activation,
         "negative_slope": method.network.negative_slope,
         "network_inputs": "every state in order, an angle as its sine and cosine; then the inputs, oldest first; then those of "
         "next_inputs one step later, which are linear between rows (the others are held)",

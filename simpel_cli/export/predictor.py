@@ -121,8 +121,15 @@ class Predictor:
         for i, (kernel, bias) in enumerate(self.layers):
             h = h @ kernel + bias[:, None]
             if i < len(self.layers) - 1:
-                h = np.where(h > 0, h, self.facts["negative_slope"] * h)
+                h = self.activated(h)
         return h * self.scale["y_std"] + self.scale["y_mean"]
+
+    def activated(self, h: np.ndarray) -> np.ndarray:
+        """Return what a hidden layer passes on of its sums."""
+        kind = self.facts.get("activation", "leaky_relu")
+        if kind == "silu":
+            return 0.5 * h * (1 + np.tanh(0.5 * h))
+        return np.tanh(h) if kind == "tanh" else np.where(h > 0, h, self.facts["negative_slope"] * h)
 
     def noise_members(self) -> np.ndarray:
         """Return the last biases, one row per network."""

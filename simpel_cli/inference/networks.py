@@ -1,5 +1,6 @@
 """Multilayer perceptrons, written for one particle and one input; vmap at the boundary."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,24 +14,35 @@ from simpel_cli.errors import ConfigError
 Layers = tuple[tuple[Float[Array, "fan_in=_ fan_out=_"], Float[Array, "fan_out=_"]], ...]
 Particles = tuple[tuple[Float[Array, "L fan_in=_ fan_out=_"], Float[Array, "L fan_out=_"]], ...]
 
+ACTIVATIONS: dict[str, Callable[[Array, float], Array]] = {  # of a layer's sums, and the slope below zero
+    "leaky_relu": jax.nn.leaky_relu,
+    "silu": lambda x, _: jax.nn.silu(x),
+    "tanh": lambda x, _: jnp.tanh(x),
+}
+
 
 @dataclass(frozen=True)
 class MLP:
-    """Fully connected network with leaky ReLU.
+    """Fully connected network.
 
     Hidden kernels are He-uniform, hidden biases U(+-1/sqrt(fan_in)), the output kernel LeCun-normal, the output bias 0.
 
     Args:
         hidden: widths of the hidden layers.
         negative_slope: slope of the leaky ReLU below zero.
+        activation: leaky_relu; silu, x/(1 + exp(-x)), or tanh, which are smooth, as what a simulator computes mostly is.
     """
 
     hidden: tuple[int, ...] = (64, 64, 64)
     negative_slope: float = 0.01
+    activation: str = "leaky_relu"
 
     def __post_init__(self) -> None:
         if not all(width >= 1 for width in self.hidden):
             raise ConfigError(f"method.network.hidden: got {list(self.hidden)}; every width must be at least 1.")
+        if self.activation not in ACTIVATIONS:
+            allowed = ", ".join(ACTIVATIONS)
+            raise ConfigError(f"method.network.activation: got {self.activation!r}; allowed are {allowed}.")
 
     def init(self, key: PRNGKeyArray, dim_in: int, dim_out: int, dtype: jnp.dtype) -> Layers:
         """Draw the weights of one network.
@@ -54,8 +66,9 @@ class MLP:
 
     def apply(self, layers: Layers, x: Float[Array, "n dx"]) -> Float[Array, "n dy"]:
         """Evaluate one network at n inputs."""
+        activation = ACTIVATIONS[self.activation]
         for kernel, bias in layers[:-1]:
-            x = jax.nn.leaky_relu(x @ kernel + bias[None], self.negative_slope)
+            x = activation(x @ kernel + bias[None], self.negative_slope)
         kernel, bias = layers[-1]
         return x @ kernel + bias[None]
 

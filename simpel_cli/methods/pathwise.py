@@ -91,7 +91,7 @@ class Pathwise:
 
     steps: int = 5000
     particles: int = 20
-    network: MLP = MLP()
+    network: MLP = MLP(activation="silu")
     learning_rate: float = 1e-2
     final_learning_rate: float = 0.01
     batch: int = 96

@@ -39,7 +39,7 @@ class SVGD:
 
     steps: int = 5000
     particles: int = 20
-    network: MLP = MLP()
+    network: MLP = MLP(activation="silu")
     learning_rate: float = 3e-3
     final_learning_rate: float = 0.03
     batch: int = 24

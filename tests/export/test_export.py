@@ -259,3 +259,27 @@ def test_the_predictor_looks_at_the_next_value_of_an_input_that_is_linear(tmp_pa
     np.testing.assert_allclose(np.diff(predictor.run({"w": 0.0}, commands)[0, :, 0]), [2.0, 4.0, 4.0])
     assert predictor.step({"w": 0.0}, commands[0]).mean["w"] == 1.0
     assert predictor.step({"w": 0.0}, commands[0], following={"u": 7.0}).mean["w"] == 7.0
+
+
+@pytest.mark.parametrize("activation", ["leaky_relu", "silu", "tanh", None])
+def test_the_predictor_has_the_activation_of_the_networks(tmp_path: Path, activation: str | None) -> None:
+    """Two networks of one hidden layer; what was exported before activations had names has a leaky ReLU."""
+    from safetensors.numpy import save_file
+
+    from simpel_cli.export.predictor import Predictor
+    from simpel_cli.inference.networks import MLP
+
+    network = MLP((4,), 0.2, activation or "leaky_relu")
+    layers = jax.vmap(lambda key: network.init(key, 1, 1, jnp.dtype(jnp.float32)))(jax.random.split(jax.random.key(0)))
+    facts = {
+        "states": [{"name": "w", "unit": "", "angle": False}], "inputs": [], "outputs": [], "past_inputs": 0,
+        "next_inputs": [], "negative_slope": 0.2,
+    } | ({} if activation is None else {"activation": activation})  # fmt: skip
+    (tmp_path / "posterior.json").write_text(json.dumps(facts))
+    arrays = {name: (np.ones if "std" in name else np.zeros)(1) for name in ("x_mean", "x_std", "y_mean", "y_std")}
+    for i, (kernel, bias) in enumerate(layers):
+        arrays |= {f"kernel_{i}": np.asarray(kernel), f"bias_{i}": np.asarray(bias)}
+    save_file(arrays | {"noise_std": np.ones(1)}, tmp_path / "posterior.safetensors")
+    x = np.linspace(-40, 40, 9)[:, None]
+    expected = network.apply_all(layers, jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(Predictor(tmp_path).targets(x), expected, rtol=1e-4, atol=1e-4)
