@@ -30,7 +30,7 @@ class MLP:
     Args:
         hidden: widths of the hidden layers.
         negative_slope: slope of the leaky ReLU below zero.
-        activation: leaky_relu; silu, x/(1 + exp(-x)), or tanh, which are smooth, as what a simulator computes mostly is.
+        activation: leaky_relu, silu or tanh. silu is x/(1 + exp(-x)): smooth, as what a simulator computes mostly is.
     """
 
     hidden: tuple[int, ...] = (64, 64, 64)

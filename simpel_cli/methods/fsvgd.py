@@ -9,14 +9,11 @@ Liu and Wang (2016), Stein variational gradient descent, eq. 8.
 from dataclasses import dataclass
 from math import log
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.methods.function_space import FunctionSpace
-
-RIDGE = 1e-2  # eta: what sets particles apart by less than that is as slow as its share
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class FSVGD(FunctionSpace):
         self, h: Float[Array, "L *d"], score: Float[Array, "L *d"]
     ) -> tuple[Float[Array, "L *d"], Float[Array, ""]]:
         """Return Stein's velocity; see `FunctionSpace.velocity`."""
-        return (newton_velocity if self.precondition else stein_velocity)(h, score, self.bandwidth)
+        return stein_velocity(h, score, self.bandwidth)
 
 
 def refuse_bandwidth(bandwidth: float | str) -> None:
@@ -61,37 +58,12 @@ def stein_velocity(
 
     Reference: Liu and Wang (2016), eq. 8.
     """
-    velocity, kernel = _summed(h, score, bandwidth)
-    return (velocity / h.shape[0]).reshape(h.shape), between(kernel)
-
-
-def newton_velocity(
-    h: Float[Array, "L *d"], score: Float[Array, "L *d"], bandwidth: float | str
-) -> tuple[Float[Array, "L *d"], Float[Array, ""]]:
-    """Return Newton's step towards the particles at which Stein's velocity is zero, and the mean off-diagonal K.
-
-    v = (K + eta I)^-1 [K s + grad K]: the same particles at rest, whatever eta, since the matrix is invertible. Under a kernel
-    that is wide enough to give a Gaussian its variance all particles move as one, and what sets them apart is L times slower
-    or worse: K s is nearly the mean score for each. Without K in front each particle follows its own score, and what is added
-    is an estimate of -grad log of the particles' density (Li and Turner 2018).
-
-    Reference: Liu et al. (2019), Understanding and accelerating particle-based variational inference (GFSF).
-    """
-    velocity, kernel = _summed(h, score, bandwidth)
-    system = kernel + RIDGE * jnp.eye(h.shape[0], dtype=h.dtype)
-    found = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(system), True), velocity)
-    return found.reshape(h.shape), between(kernel)
-
-
-def _summed(
-    h: Float[Array, "L *d"], score: Float[Array, "L *d"], bandwidth: float | str
-) -> tuple[Float[Array, "L _"], Float[Array, "L L"]]:
-    """Return sum_l [K_li s_l + grad_{h_l} K_li], flat, and the kernel."""
-    flat, drive = h.reshape(h.shape[0], -1), score.reshape(h.shape[0], -1)
+    n = h.shape[0]
+    flat, drive = h.reshape(n, -1), score.reshape(n, -1)
     kernel, width_squared = kernel_between(flat, bandwidth)
     # sum_l grad_{h_l} K_li = sum_l K_li (h_i - h_l) / s^2
     repulsion = (jnp.sum(kernel, axis=0)[:, None] * flat - kernel.T @ flat) / width_squared
-    return kernel.T @ drive + repulsion, kernel
+    return ((kernel.T @ drive + repulsion) / n).reshape(h.shape), between(kernel)
 
 
 def between(kernel: Float[Array, "L L"]) -> Float[Array, ""]:

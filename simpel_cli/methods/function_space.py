@@ -28,7 +28,7 @@ from simpel_cli.inference.networks import MLP
 from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.protocols import Counted, Inference, Info, Problem, Setting
 from simpel_cli.methods.particle_networks import Networks, State, refuse_rates
-from simpel_cli.methods.posterior_axes import Basis, axes_of, basis
+from simpel_cli.methods.preconditioner import Basis, basis, preconditioned
 from simpel_cli.scores.estimator import Score, fitted
 from simpel_cli.scores.gaussian import moments
 
@@ -68,36 +68,38 @@ class FunctionSpace(ABC):
         weight_decay: of AdamW, on network weights only.
         batch: training points per step, at most; drawn without replacement.
         fresh_points: points of the domain per step.
-        pool: points of the domain that a stretch of steps chooses from; a power of two. A step has no more points than that,
-            and a batch no more than half of it.
+        pool: points of the domain that a stretch of steps chooses from; a power of two.
         sets: measurement sets that a stretch of steps chooses from, at least; more, up to 256, where so many batches are not
             as many as the data.
         prior_weight: exponent of the prior; 1 is Bayes.
-        precondition: the rule works in the coordinates of the posterior, per output (`posterior_axes.py`), and takes Newton's
-            steps; else on raw function values of all outputs together.
+        precondition: go in Newton's direction of the function values (`preconditioner.py`): for rules whose particles climb
+            on their own, which else need many times the steps where data are few.
         noise: observation noise.
     """
 
-    steps: int = 2000
+    steps: int = 5000
     particles: int = 20
     network: MLP = MLP(activation="silu")
-    learning_rate: float = 2e-2
-    final_learning_rate: float = 0.01
+    learning_rate: float = 3e-3
+    final_learning_rate: float = 0.03
     weight_decay: float = 1e-3
-    batch: int = 64
-    fresh_points: int = 64
+    batch: int = 24
+    fresh_points: int = 16
     pool: int = 1024
     sets: int = 128
     prior_weight: float = 1.0
-    precondition: bool = True
+    precondition: bool = False
     noise: NoiseModel = NoiseModel()
 
     uses_score = True  # not a field
 
     def __post_init__(self) -> None:
         check_at_least_one("method", self, ("steps", "particles", "batch", "fresh_points", "pool", "sets"))
-        if self.pool & (self.pool - 1):
-            raise ConfigError(f"method.pool: got {self.pool}; it must be a power of two.")
+        points = self.batch + self.fresh_points  # fresh ones fill the batch where data are fewer
+        if self.pool & (self.pool - 1) or self.pool < points:
+            raise ConfigError(
+                f"method.pool: got {self.pool}; it must be a power of two and at least batch + fresh_points ({points})."
+            )
         if self.precondition and not self.prior_weight > 0:
             raise ConfigError(f"method.precondition: it needs a prior, and method.prior_weight is {self.prior_weight}.")
         refuse_rates(self.learning_rate, self.final_learning_rate)
@@ -116,7 +118,6 @@ class FunctionSpace(ABC):
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=self.final_learning_rate)
         optimiser = optax.adamw(rate, weight_decay=self.weight_decay, mask=(True, False))
 
-        size = min(self.batch, n_rows, max(self.pool // 2, 1))
         count = max(self.sets, min(-(-n_rows // self.batch), MOST_SETS))
         networks = Networks(self.particles, self.network, self.noise, optimiser, problem)
 
@@ -148,14 +149,12 @@ class FunctionSpace(ABC):
         def measurement_set(key: PRNGKeyArray) -> tuple[Int[Array, " b"], Bool[Array, " b"], Int[Array, " k"]]:
             """Rows of the batch, which of them are data, and rows of the bank: the batch and distinct fresh points."""
             key_batch, key_offset, key_stride = jax.random.split(key, 3)
-            batch, is_data = distinct_rows(key_batch, size, jnp.asarray(problem.m))
+            batch, is_data = distinct_rows(key_batch, min(self.batch, n_rows), jnp.asarray(problem.m))
             # an odd stride visits a power of two of rows without repeats: distinct points without a sort
             b, kind = batch.shape[0], batch.dtype
             offset = jax.random.randint(key_offset, (), 0, self.pool, kind)
             stride = 2 * jax.random.randint(key_stride, (), 0, max(self.pool // 2, 1), kind) + 1
-            fresh = (
-                n_rows + (offset + stride * jnp.arange(min(b + self.fresh_points, self.pool), dtype=kind)) % self.pool
-            )
+            fresh = n_rows + (offset + stride * jnp.arange(b + self.fresh_points, dtype=kind)) % self.pool
             # fresh points fill the batch where there are fewer data than it has room for
             return batch, is_data, fresh.at[:b].set(jnp.where(is_data, batch, fresh[:b]))
 
@@ -193,14 +192,12 @@ class FunctionSpace(ABC):
             )(h[:, :b], state.noise)
             prior_score = jax.vmap(lambda score, h: score(h), in_axes=(0, 2), out_axes=2)(scores, h)
             score = (self.prior_weight * prior_score).at[:, :b].add(weight * score_data)
-            if prior_basis is None:
-                velocity, mean_kernel = self.velocity(h, score)
-            else:
+            velocity, mean_kernel = self.velocity(h, score)
+            if prior_basis is not None:
                 evenly = networks.noise_scale(state.noise) ** 2 * h.shape[1] / jnp.maximum(problem.m, 1).astype(dtype)
                 if problem.tails is not None:
                     evenly = evenly / student_t.information(problem.tails)[0]
-                posterior = axes_of(prior_basis, evenly, self.prior_weight)
-                velocity, mean_kernel = posterior.moved(self.velocity, h, score)
+                velocity = preconditioned(velocity, prior_basis, evenly, self.prior_weight)
 
             (ascent,) = pull_back(velocity)
             after = networks.ascended(state, ascent, weight * score_noise)

@@ -1,7 +1,7 @@
 """The published reference's own arrays (SIMPEL_SHARED/reference) as learning problems of this project.
 
 Simulators: pendulum_published; rc_car, the kinematic bicycle, with the action three steps old as its input, as the arrays
-have it. Gap GP l = 10 raw, N = 1028; the methods as their YAML has them.
+have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 24 + 16 points, the reference's number of steps.
 """
 
 from functools import partial
@@ -22,6 +22,7 @@ from simpel_cli.inference.system import normaliser_of, system_of
 from simpel_cli.priors.function_prior import GapGP, GPPrior, SimulatorPrior
 from simpel_cli.runs.settings import stream
 
+STEPS = {20: 5000, 50: 5000, 320: 7000, 400: 8000}  # of the reference, per training size
 SIMULATORS = {"pendulum": "pendulum_published", "rc_car": "rc_car"}
 # of the measurements per output component; of the car, that which the reference simulates
 NOISE = {
@@ -38,7 +39,7 @@ class Case(NamedTuple):
     """A learning problem, ready to be compiled.
 
     Args:
-        rule: the method.
+        rule: with the reference's number of steps.
         assembled: problem arrays of every seed.
         normaliser: of the system.
         keys: one per seed.
@@ -84,9 +85,19 @@ def prior_of(method: str, scale: str | float, draws: int) -> SimulatorPrior | GP
     return SimulatorPrior(gap=gap, draws=draws)
 
 
-def rule_of(method: str, fields: dict[str, Any]) -> Method:
-    """Return the method of its YAML, but for some fields."""
-    return build(node("method", method) | fields, "method")
+def rule_of(method: str, steps: int, fields: dict[str, Any], kind: str) -> Method:
+    """Return the method of its YAML; those that train networks take the given number of steps.
+
+    On the car FSVGD and GreyBox have the published bandwidth, 10, with which they do better than with 2.
+    """
+    given = node("method", method)
+    if kind == "rc_car" and method in ("fsvgd", "greybox"):
+        given.get("residual", given)["bandwidth"] = 10.0
+    if "residual" in given:
+        given["residual"] |= {"steps": steps}
+    elif "network" in given:
+        given |= {"steps": steps}
+    return build(given | fields, "method")
 
 
 def case(
@@ -114,10 +125,10 @@ def case(
         law: of the noise: gaussian, student_t or auto.
     """
     arrays = dict(np.load(folder() / f"{name}.npz"))
-    kind = name.rsplit("_n", 1)[0]
+    kind, size = name.rsplit("_n", 1)
     system = system_of(build(node("sim", SIMULATORS[kind]), "sim").model(), (), 0)
     normaliser = normaliser_of(system, stream(0, "normaliser"))
-    rule = rule_of(method, fields or {})
+    rule = rule_of(method, STEPS[int(size.split("_")[0])], fields or {}, kind)
     x, y = (np.asarray(arrays[k], float) for k in ("x_train", "y_train_diff"))
     if rows is not None:
         chosen = np.random.default_rng(0).integers(0, len(x), rows)

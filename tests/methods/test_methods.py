@@ -21,6 +21,7 @@ from simpel_cli.methods.fmap import FunctionMAP
 from simpel_cli.methods.fsvgd import FSVGD, stein_velocity
 from simpel_cli.methods.greybox import GreyBox
 from simpel_cli.methods.pathwise import Pathwise
+from simpel_cli.methods.preconditioner import basis, preconditioned
 from simpel_cli.methods.repulsive import Repulsive
 from simpel_cli.methods.svgd import SVGD
 from simpel_cli.methods.sysid import SysID
@@ -173,6 +174,19 @@ def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     mean, covariance = oracles.gp_posterior(k(X, X), k(GRID, X), k(GRID, GRID), y[:, 0] - np.asarray(at_data), NOISE)
     np.testing.assert_allclose(found.mean[:, 0], np.asarray(line_alone.mean[:, 0]) + mean, atol=1e-4)
     np.testing.assert_allclose(found.epistemic_std[:, 0], np.sqrt(np.diag(covariance)), rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.3])
+def test_preconditioner_is_the_inverse_curvature_of_data_spread_evenly(weight: float) -> None:
+    random = np.random.default_rng(2)
+    factor = random.normal(size=(2, 6, 6))
+    prior, evenly = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6), np.array([0.3, 2.0])
+    velocity = random.normal(size=(3, 6, 2))
+    own = basis(jnp.asarray(prior), jnp.dtype(jnp.float64))
+    found = preconditioned(jnp.asarray(velocity), own, jnp.asarray(evenly), weight)
+    for i in range(2):
+        curvature = weight * np.linalg.inv(prior[i]) + np.eye(6) / evenly[i]
+        np.testing.assert_allclose(found[:, :, i], np.linalg.solve(curvature, velocity[:, :, i].T).T, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -408,15 +422,6 @@ def test_a_stretch_of_steps_chooses_among_all_its_sets_and_each_has_the_prior_of
     assert len(set(losses)) == sets
 
 
-def test_of_a_small_pool_a_step_has_fewer_points_none_of_them_twice() -> None:
-    """64 + 64 are asked for; of 16 points of the domain and 24 data, 8 of each."""
-    rule = FSVGD(particles=2, network=MLP((4,)), pool=16, sets=3).bind(setting_of(prior_of()), problem_of(1.3 * X))
-    drawn = rule.draw(jax.random.key(0), rule.init(jax.random.key(1)))
-    assert drawn.x.shape == (3, 16, 1)
-    assert drawn.batch.shape == (3, 8)
-    assert all(len(np.unique(np.asarray(x))) == 16 for x in drawn.x)
-
-
 EVERY = {
     "fsvgd": FSVGD(steps=6, **FEW), "map": FunctionMAP(steps=6, **FEW), "repulsive": Repulsive(steps=6, **FEW),
     "svgd": SVGD(steps=6, **SMALL), "sysid": SysID(steps=6, starts=2, particles=3),
@@ -488,7 +493,7 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
         (lambda: SVGD(bandwidth="wide"), "method.bandwidth"), (lambda: Repulsive(bandwidth=-1.0), "method.bandwidth"),
         (lambda: ExactGP(particles=1), "method.particles"), (lambda: FunctionMAP(learning_rate=0.0), "method.learning_rate"),
         (lambda: dataclasses.replace(FSVGD(), bandwidth=0.0), "method.bandwidth"),
-        (lambda: FSVGD(sets=0), "method.sets"), (lambda: FSVGD(pool=33), "method.pool: got 33; it must be a power of two"),
+        (lambda: FSVGD(sets=0), "method.sets"), (lambda: FSVGD(pool=32), r"batch \+ fresh_points \(40\)"),
         (lambda: Repulsive(precondition=True, prior_weight=0.0), "prior_weight"),
         (lambda: MLP(activation="relu"), "method.network.activation: got 'relu'; allowed are leaky_relu, silu, tanh"),
     ],
