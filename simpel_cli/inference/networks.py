@@ -14,6 +14,7 @@ from simpel_cli.errors import ConfigError
 Layers = tuple[tuple[Float[Array, "fan_in=_ fan_out=_"], Float[Array, "fan_out=_"]], ...]
 Particles = tuple[tuple[Float[Array, "L fan_in=_ fan_out=_"], Float[Array, "L fan_out=_"]], ...]
 
+SLOPE = 0.01
 ACTIVATIONS: dict[str, Callable[[Array, float], Array]] = {  # of a layer's sums, and the slope below zero
     "leaky_relu": jax.nn.leaky_relu,
     "silu": lambda x, _: jax.nn.silu(x),
@@ -29,12 +30,12 @@ class MLP:
 
     Args:
         hidden: widths of the hidden layers.
-        negative_slope: slope of the leaky ReLU below zero.
+        negative_slope: slope of the leaky ReLU below zero; the others have none to choose.
         activation: leaky_relu, silu or tanh. silu is x/(1 + exp(-x)): smooth, as what a simulator computes mostly is.
     """
 
     hidden: tuple[int, ...] = (64, 64, 64)
-    negative_slope: float = 0.01
+    negative_slope: float = SLOPE
     activation: str = "leaky_relu"
 
     def __post_init__(self) -> None:
@@ -43,6 +44,11 @@ class MLP:
         if self.activation not in ACTIVATIONS:
             allowed = ", ".join(ACTIVATIONS)
             raise ConfigError(f"method.network.activation: got {self.activation!r}; allowed are {allowed}.")
+        if self.activation != "leaky_relu" and self.negative_slope != SLOPE:
+            raise ConfigError(
+                f"method.network.negative_slope: got {self.negative_slope}; {self.activation} has no slope to choose. Use it "
+                "with method.network.activation=leaky_relu."
+            )
 
     def init(self, key: PRNGKeyArray, dim_in: int, dim_out: int, dtype: jnp.dtype) -> Layers:
         """Draw the weights of one network.

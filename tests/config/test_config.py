@@ -15,6 +15,7 @@ from simpel_cli.config.folders import conf_dir
 from simpel_cli.config.overrides import checked, count_jobs
 from simpel_cli.data import Measurements
 from simpel_cli.evaluation.settings import Evaluation
+from simpel_cli.inference.networks import MLP
 from simpel_cli.runs.settings import Settings
 from simulators.built import Built
 from simulators.model import Model
@@ -145,6 +146,19 @@ class TestValuesInYamlAreTheDefaults:
         node.pop("defaults", None)
         built = build(node, group)
         assert built == type(built)()
+
+    def test_all_methods_have_the_same_networks(self) -> None:
+        """A comparison of methods is none of networks. What an older run says of its network, without an activation, stays."""
+        found = []
+        for path in sorted((CONF / "method").glob("*.yaml")):
+            node = resolved(yaml.safe_load(path.read_text()))
+            built = build({k: v for k, v in node.items() if k != "defaults"}, "method")
+            built = getattr(built, "residual", built)
+            found += [built.network] if hasattr(built, "network") else []
+        assert len(found) > 8
+        assert set(found) == {MLP((64, 64, 64), 0.01, "silu")}
+        older = {"_target_": "simpel_cli.methods.fsvgd.FSVGD", "network": {"hidden": [8], "negative_slope": 0.2}}
+        assert build(older, "method").network == MLP((8,), 0.2, "leaky_relu")
 
 
 class TestOverrides:

@@ -15,6 +15,7 @@ from simpel_cli.discovery.search.gate.held_out import (
     AHEAD,
     LEAST_BLOCKS,
     LEAST_OF_BLOCK,
+    MOST_FOLDS,
     RUNAWAY,
     _blocks,
     _judged,
@@ -191,9 +192,13 @@ def test_an_effect_is_judged_on_every_window_that_had_no_part_in_its_parameters(
     search: Any = searched("b")
     windows, spare = windows_of(episode, 0), windows_of([0] * 5 + [1] * 3, 100)
     search.plan = search.plan._replace(windows=windows, spare=spare)
-    search.fitter, search.loud, assessor = Fits(search.noise, windows), lambda z: z, Likelihoods()
+    search.fitter, assessor = Fits(search.noise, windows), Likelihoods()
+    loud = list[np.ndarray]()
+    search.loud = lambda z: (loud.append(z), z)[1]
     trials = [Trial((), optimum(np.array([k, -1.0]))) for k in range(3)]
     first, second = gates(search, assessor, trials[0], trials[1:])
+    folds = min(MOST_FOLDS, 3 if unit == "episode" else len(episode))
+    assert len(loud) == folds * len(trials)  # each model is fitted from two beginnings, without each fold
     assert sorted(set(assessor.seen)) == held_out
     assert first[:4] == second[:4]
     assert first.unit == unit
@@ -267,7 +272,7 @@ def test_one_odd_block_decides_nothing_of_the_likelihood() -> None:
     assert _judged(_tempered(gains), errors, grown, ("y",), np.arange(20), "block").grows == ("y in free run",)
 
 
-def test_a_short_record_is_judged_on_blocks_that_lie_between_others() -> None:
+def test_a_short_record_is_judged_on_blocks_that_lie_between_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """A load of 0.5 m/s^2 that acts in the last quarter alone: no fit without that quarter knows of it."""
     load = Expression("load", acts_on="v", term="c*(u > 2)", parameters={"c": {"range": [-2, 2], "unit": "1/T^2"}})
     random = np.random.default_rng(1)
@@ -283,7 +288,10 @@ def test_a_short_record_is_judged_on_blocks_that_lie_between_others() -> None:
     search = measured_search(recording, [load], cart(0.5, 1.5))
     base = search.base()
     trial = next(t for t in search.add(base, [0]).trials)
+    begun, loud = list[np.ndarray](), search.loud
+    monkeypatch.setattr(search, "loud", lambda z: (begun.append(z), loud(z))[1])
     (judged,) = gates(search, Assessor(search.plan, 5), trial, [base])
+    assert len(begun) == 2 * MOST_FOLDS  # both models, without each fold, from two beginnings
     assert judged.unit == "block"
     assert judged.passed
     (other,) = gates(search, Assessor(search.plan, 5), base, [trial])

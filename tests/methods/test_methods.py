@@ -495,6 +495,7 @@ def test_every_method_goes_on_bit_for_bit_in_float32_with_two_outputs_far_from_z
         (lambda: dataclasses.replace(FSVGD(), bandwidth=0.0), "method.bandwidth"),
         (lambda: FSVGD(sets=0), "method.sets"), (lambda: FSVGD(pool=32), r"batch \+ fresh_points \(40\)"),
         (lambda: Repulsive(precondition=True, prior_weight=0.0), "prior_weight"),
+        (lambda: MLP(negative_slope=0.2, activation="silu"), "method.network.negative_slope: got 0.2; silu has no slope"),
         (lambda: MLP(activation="relu"), "method.network.activation: got 'relu'; allowed are leaky_relu, silu, tanh"),
     ],
 )  # fmt: skip
