@@ -269,11 +269,12 @@ def test_the_predictor_has_the_activation_of_the_networks(tmp_path: Path, activa
     from simpel_cli.export.predictor import Predictor
     from simpel_cli.inference.networks import MLP
 
-    network = MLP((4,), 0.2, activation or "leaky_relu")
+    slope = 0.2 if activation in ("leaky_relu", None) else 0.01
+    network = MLP((4,), slope, activation or "leaky_relu")
     layers = jax.vmap(lambda key: network.init(key, 1, 1, jnp.dtype(jnp.float32)))(jax.random.split(jax.random.key(0)))
     facts = {
         "states": [{"name": "w", "unit": "", "angle": False}], "inputs": [], "outputs": [], "past_inputs": 0,
-        "next_inputs": [], "negative_slope": 0.2,
+        "next_inputs": [], "negative_slope": slope,
     } | ({} if activation is None else {"activation": activation})  # fmt: skip
     (tmp_path / "posterior.json").write_text(json.dumps(facts))
     arrays = {name: (np.ones if "std" in name else np.zeros)(1) for name in ("x_mean", "x_std", "y_mean", "y_std")}
