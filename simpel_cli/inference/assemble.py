@@ -109,6 +109,7 @@ def assemble(
             weights=None if weights is None else pad_rows(weights, length),
             precision=None if relative is None else pad_rows(relative, length),
             tells=None if tells is None else pad_rows(tells, length),
+            gap_relevance=own.relevance,
         )
         problems.append(arrays)
 

@@ -127,7 +127,7 @@ def sites(moments: Moments, i: int, beyond: np.ndarray, kappa: float, sigma: flo
         weights: how much every row counts: its noise has the variance sigma^2/weight, (m,).
     """
     samples = moments.samples[:, :, i]
-    covariance = np.atleast_2d(np.cov(samples, rowvar=False)) + kappa**2 * moments.correlation
+    covariance = np.atleast_2d(np.cov(samples, rowvar=False)) + kappa**2 * moments.correlation_of(i)
     covariance = covariance + moments.white * np.eye(len(beyond))
     mean, at, rest = samples.mean(axis=0), np.flatnonzero(beyond), np.flatnonzero(beyond == 0)
     among, known = covariance[np.ix_(at, at)], mean[at]
@@ -163,7 +163,7 @@ def with_sites(chooser: Chooser, training: Training, chosen: Chosen, key: PRNGKe
         assert own.beyond is not None
         if not own.beyond.any():
             continue
-        moments = chooser.moments(own, jax.random.fold_in(key, k))
+        moments = chooser.moments(own, jax.random.fold_in(key, k), chosen.relevance)
         sigma = _noise(chooser, moments, chosen)
         if chosen.law is not None:  # its scale holds the white model error, too
             moments = moments._replace(white=0.0)

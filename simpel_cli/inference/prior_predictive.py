@@ -89,6 +89,7 @@ def check_prior(
     key: PRNGKeyArray,
     bank: Bank | None = None,
     relative: np.ndarray | None = None,
+    gap_relevance: np.ndarray | None = None,
 ) -> PriorCheck | None:
     """Compare the training targets with draws of the prior; None: there are too few draws to tell.
 
@@ -105,6 +106,7 @@ def check_prior(
         key: of the draws.
         bank: draws at the training inputs, where the simulator can only be queried.
         relative: (m, dy) noise of every target over the typical one; None: 1.
+        gap_relevance: (dy, dx) one over the gap's lengthscales; None: those of the prior.
     """
     rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), MOST_ROWS)).round().astype(int))
     x, y = x[rows], y[rows]
@@ -120,7 +122,8 @@ def check_prior(
     noise = measurement_noise(system, x, noise_std, key, None if relative is None else relative[rows]) / y_std
     at = jnp.asarray((x - normaliser.x_mean) / normaliser.x_std, jnp.float64)
     scale = np.zeros(y.shape[1]) if gap_scale is None else np.asarray(gap_scale, float)
-    known = np.asarray(setting.prior.covariance(at, jnp.asarray(scale)), float)  # with the white model error
+    own = () if gap_relevance is None else (jnp.asarray(gap_relevance, jnp.float64),)
+    known = np.asarray(setting.prior.covariance(at, jnp.asarray(scale), *own), float)  # with the white model error
     white = known[:, 0, 0] - scale**2
     # one row among all of them lies further out with probability SURPRISING
     wider = ndtri(1 - SURPRISING / (2 * targets.size))

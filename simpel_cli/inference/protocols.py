@@ -51,6 +51,7 @@ class Problem(NamedTuple):
     None: all count alike; where `tells` is 0, the target says nothing of sigma (it was estimated, or lies at a sensor's end).
     `weights` is what a rule in closed form takes of both, precision times expected weight under Student's t; None: 1.
     `noise_rms` is the typical scale of every target's noise in the unit of its expression (`noise_scale`); None: it has none.
+    `gap_relevance` is one over the gap's lengthscale, of every normalised input to every output; None: those of the prior.
     """
 
     x: Float[Numbers, "m_padded dx"]
@@ -66,6 +67,7 @@ class Problem(NamedTuple):
     precision: Float[Numbers, "m_padded dy"] | None = None
     tells: Float[Numbers, "m_padded dy"] | None = None
     noise_rms: Float[Numbers, " dy"] | None = None
+    gap_relevance: Float[Numbers, "dy dx"] | None = None
 
     def counted(self, rows: Int[Array, " b"] | None = None) -> "Counted | None":
         """Return how much targets count; rows: which of them, None: all; None: all count alike."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from simpel_cli.errors import ConfigError
 from simpel_cli.inference.noise import NoiseModel
@@ -13,6 +13,7 @@ from simpel_cli.inference.protocols import Normaliser, Training, multiplied
 from simpel_cli.inference.system import System
 from simpel_cli.priors.function_prior import FunctionPrior, GapGP, GPPrior, SimulatorPrior
 from simpel_cli.priors.gap_scale import marginal_likelihood_scales
+from simpel_cli.priors.lengthscales import most_likely
 from simpel_cli.priors.marginal_likelihood import TYPICAL_SCALE, noise_of_smooth
 from simpel_cli.priors.noise_law import (
     LEAST_GAIN,
@@ -65,21 +66,67 @@ class Chooser(NamedTuple):
                 given = self.system.encoding.per_target(self.system.source.gap, np.nan) / self.normaliser.y_std
         return given
 
-    def correlation(self, x: np.ndarray, longer: float = 1.0) -> Array:
-        """Correlation per output at inputs (m, dx), of a lengthscale so many times the declared one."""
-        normalised = (x - self.normaliser.x_mean) / self.normaliser.x_std
-        other = self.bound._replace(white_variance=0.0, input_scale=np.asarray(self.bound.input_scale) / longer)
-        return other.covariance(jnp.asarray(normalised), jnp.ones(self.system.encoding.dim_y))
+    @property
+    def declared(self) -> np.ndarray | None:
+        """Relevances that the lengthscales to be chosen are near to, (dy, dx); None: they are declared."""
+        gap: GapGP | None = self.prior.gap
+        if gap is None or not gap.learns_lengthscales:
+            return None
+        return np.tile(np.asarray(self.bound.input_scale, float), (self.system.encoding.dim_y, 1))
 
-    def moments(self, training: Training, key: PRNGKeyArray) -> Moments:
-        """Return the prior at training rows with normalised targets."""
+    def normalised(self, x: np.ndarray) -> np.ndarray:
+        """Return inputs (m, dx) of unit variance on the domain."""
+        return np.asarray((x - self.normaliser.x_mean) / self.normaliser.x_std)
+
+    def correlation(self, x: np.ndarray, longer: float = 1.0, relevance: np.ndarray | None = None) -> np.ndarray:
+        """Correlation of the gap at inputs (m, dx), of lengthscales so many times the declared ones.
+
+        Returns:
+            (d, m, m): of all outputs together, d = 1, or, with relevances, of each.
+        """
+        if self.bound.kernel is None:
+            return np.zeros((1, len(x), len(x)))
+        at = jnp.asarray(self.normalised(x))
+        other = self.bound._replace(input_scale=np.asarray(self.bound.input_scale) / longer)
+        return np.asarray(other.correlation(at, at, relevance))
+
+    def relevances(self, x: np.ndarray, moments: Moments, weights: np.ndarray | None = None) -> np.ndarray | None:
+        """Return the most probable relevances of every output, (dy, dx); None: the lengthscales are declared.
+
+        Args:
+            x: inputs of the moments, (m, dx).
+            moments: of the prior there.
+            weights: of all rows where the noise is Student's t, which holds the white model error, too, (m, dy).
+        """
+        kernel, declared, given = self.bound.kernel, self.declared, self.given
+        if kernel is None or declared is None:
+            return None
+        at, found = self.normalised(x), []
+        for i, own in enumerate(declared):
+            rows = moments.rows(i)
+            counts = multiplied(moments.precision, weights)
+            white = np.full(len(rows), 0.0 if weights is not None else moments.white)
+            found.append(
+                most_likely(
+                    kernel, at[rows], moments.samples[:, rows, i], moments.targets[rows, i], white, own,
+                    float(self.noise_init[i]), None if np.isnan(given[i]) else float(given[i]),
+                    None if counts is None else counts[rows, i],
+                )
+            )  # fmt: skip
+        return np.stack(found)
+
+    def moments(self, training: Training, key: PRNGKeyArray, relevance: np.ndarray | None = None) -> Moments:
+        """Return the prior at training rows with normalised targets; relevance: that was chosen."""
         x, targets = training.x, training.y
         samples = np.zeros((2, *targets.shape))
         if self.prior.uses_simulator:
             drawn = self.system.simulate(key, x, SCALE_DRAWS)
             samples = (drawn - self.normaliser.y_mean) / self.normaliser.y_std
         white = self.prior.white_variance
-        return Moments(samples, np.asarray(self.correlation(x)[0]), targets, white, training.precision, training.tells)
+        correlation = self.correlation(x, relevance=relevance)
+        if len(correlation) == 1:
+            correlation = correlation[0]
+        return Moments(samples, correlation, targets, white, training.precision, training.tells)
 
 
 class Chosen(NamedTuple):
@@ -89,11 +136,13 @@ class Chosen(NamedTuple):
         gap: kappa, normalised, (dy,).
         noise: sigma of the largest marginal likelihood, 0 where it is not asked for, (dy,).
         law: Student's t noise, weights of all rows; None: Gaussian.
+        relevance: one over the gap's lengthscales, (dy, dx); None: as they are declared.
     """
 
     gap: np.ndarray
     noise: np.ndarray
     law: Law | None
+    relevance: np.ndarray | None = None
 
 
 class Looked(NamedTuple):
@@ -104,6 +153,7 @@ class Looked(NamedTuple):
         rows: that were looked at; None: there were none, or nothing was to be chosen.
         moments: of the prior there.
         gain: nats by which every tail of Student's t is ahead, (T,).
+        relevance: see `Chosen`.
     """
 
     gap: np.ndarray
@@ -111,6 +161,7 @@ class Looked(NamedTuple):
     rows: np.ndarray | None
     moments: Moments | None
     gain: np.ndarray
+    relevance: np.ndarray | None
 
 
 def chosen(
@@ -141,26 +192,29 @@ def chosen(
     gain = np.mean([one.gain for one in looked], axis=0).max()
     heavy = gain > LEAST_GAIN if kept is None else kept == "student_t"
     if law == "gaussian" or looked[0].moments is None or (law == "auto" and not heavy):
-        return [Chosen(one.gap, one.noise, None) for one in looked], float(gain)
+        return [Chosen(one.gap, one.noise, None, one.relevance) for one in looked], float(gain)
     return [_heavy(chooser, *each) for each in zip(looked, training, keys, strict=True)], float(gain)
 
 
 def _looked(chooser: Chooser, training: Training, key: PRNGKeyArray, law: str) -> Looked:
-    """Kappa is what the prior declares; what it does not is chosen by marginal likelihood, as sigma is."""
+    """Kappa and lengthscales are what the prior declares; what it does not is chosen by marginal likelihood, as sigma is."""
     size, noise, given = chooser.system.encoding.dim_y, chooser.noise, chooser.given
-    unknown, x = np.full(len(TAILS), np.nan), training.x
+    unknown, x, relevance = np.full(len(TAILS), np.nan), training.x, chooser.declared
     # of more rows than are looked at networks learn the noise better than those tell it
     with_noise = noise.learn and noise.marginal_share > 0 and 0 < len(x) <= chooser.most_rows
     with_law = law != "gaussian" and noise.learn and (len(x) >= LEAST_ROWS or law == "student_t")
     if len(x) == 0:  # nothing to choose by
-        return Looked(np.where(np.isnan(given), TYPICAL_SCALE, given), np.zeros(size), None, None, unknown)
-    if not (np.isnan(given).any() or with_noise or with_law):
-        return Looked(given, np.zeros(size), None, None, unknown)
+        return Looked(np.where(np.isnan(given), TYPICAL_SCALE, given), np.zeros(size), None, None, unknown, relevance)
+    if not (np.isnan(given).any() or with_noise or with_law or relevance is not None):
+        return Looked(given, np.zeros(size), None, None, unknown, None)
     rows = np.arange(len(x))
     if len(x) > chooser.most_rows:  # the first ones may all be of one episode
         key, key_rows = jax.random.split(key)
         rows = np.asarray(jax.random.choice(key_rows, len(x), (chooser.most_rows,), replace=False))
     moments = chooser.moments(training.take(rows), key)
+    relevance = chooser.relevances(x[rows], moments)
+    if relevance is not None:
+        moments = moments._replace(correlation=chooser.correlation(x[rows], relevance=relevance))
     found = [
         marginal_likelihood_scales(
             *moments.whitened(i),
@@ -175,7 +229,8 @@ def _looked(chooser: Chooser, training: Training, key: PRNGKeyArray, law: str) -
     gain = gain_of_tails(moments, scale, sigma) if with_law else unknown
     if with_noise:
         sigma = _smooth(chooser, x[rows], moments, sigma)
-    return Looked(scale, sigma if with_noise or with_law else np.zeros(size), rows, moments if with_law else None, gain)
+    sigma = sigma if with_noise or with_law else np.zeros(size)
+    return Looked(scale, sigma, rows, moments if with_law else None, gain, relevance)
 
 
 def _smooth(
@@ -185,8 +240,8 @@ def _smooth(
     if chooser.prior.uses_simulator:
         return sigma
     left = noise_of_smooth(
-        lambda longer: chooser.correlation(x, longer)[0], moments.targets, np.array(len(x), np.int32), moments.white, 1.0,
-        np.full(len(sigma), 1e-3), chooser.noise_init, multiplied(law, moments.precision), moments.tells,
+        lambda longer: jnp.asarray(chooser.correlation(x, longer)[0]), moments.targets, np.array(len(x), np.int32),
+        moments.white, 1.0, np.full(len(sigma), 1e-3), chooser.noise_init, multiplied(law, moments.precision), moments.tells,
     )  # fmt: skip
     return np.maximum(sigma, np.asarray(left))
 
@@ -195,12 +250,17 @@ def _heavy(chooser: Chooser, looked: Looked, training: Training, key: PRNGKeyArr
     """Return the choice for noise that is Student's t."""
     assert looked.moments is not None
     assert looked.rows is not None
-    law = student_t(looked.moments, looked.gap, looked.noise, chooser.noise_init, given=chooser.given)
-    scale = _smooth(chooser, training.x[looked.rows], looked.moments, law.scale, law.weights)
+    x, moments, init = training.x[looked.rows], looked.moments, chooser.noise_init
+    law = student_t(moments, looked.gap, looked.noise, init, given=chooser.given)
+    relevance = chooser.relevances(x, moments, law.weights)
+    if relevance is not None:  # a few rows that are far off had bent the gap
+        moments = moments._replace(correlation=chooser.correlation(x, relevance=relevance))
+        law = student_t(moments, law.gap, law.scale, init, given=chooser.given)
+    scale = _smooth(chooser, x, moments, law.scale, law.weights)
     weights = np.ones(training.y.shape)
     weights[looked.rows] = law.weights
     rest = np.setdiff1d(np.arange(len(training.x)), looked.rows)
     for k, rows in enumerate(np.array_split(rest, -(-len(rest) // chooser.most_rows)) if len(rest) else []):
-        moments = chooser.moments(training.take(rows), jax.random.fold_in(key, k))
+        moments = chooser.moments(training.take(rows), jax.random.fold_in(key, k), relevance)
         weights[rows] = weights_of(law, moments)
-    return Chosen(law.gap, scale, law._replace(weights=weights, scale=scale))
+    return Chosen(law.gap, scale, law._replace(weights=weights, scale=scale), relevance)

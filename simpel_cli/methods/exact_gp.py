@@ -22,7 +22,6 @@ from simpel_cli.inference.noise import NoiseModel, Numbers
 from simpel_cli.inference.predictive import Predictive
 from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods.sysid import Identified, SysID, identified, simulator_of
-from simpel_cli.priors.gaussian_process import gram
 from simpel_cli.priors.marginal_likelihood import Spectrum, best_scales, weighted_spectra
 
 
@@ -74,30 +73,33 @@ class ExactGP:
         prior, run = simulator_of(setting)
         if prior.kernel is None:
             raise ConfigError("method: gp needs the gap process of prior=simulator; prior=simulator_only has none.")
-        kernel, scale, dtype = prior.kernel, problem.normaliser, problem.x.dtype
+        scale, dtype = problem.normaliser, problem.x.dtype
         # noise with heavy tails holds the white model error, too (`priors.noise_law`)
         white = prior.white_variance if problem.tail is None else 0.0
         counts = (jnp.arange(problem.x.shape[0], dtype=jnp.int32) < problem.m).astype(jnp.float64)
         kappa = jnp.asarray(problem.gap_scale).astype(jnp.float64)
+        weights = problem.weights
+        if weights is None and problem.gap_relevance is not None:  # each output has a basis of its own
+            weights = jnp.ones_like(problem.y)
 
         def simulated(phi: Float[Array, " dp"], x: Float[Numbers, "n dx"]) -> Float[Array, "n dy"]:
             return (jax.vmap(run, in_axes=(0, None))(jnp.asarray(x), phi) - scale.y_mean[None]) / scale.y_std[None]
 
-        def scaled(x: Float[Numbers, "n dx"]) -> Float[Array, "n dx"]:
-            return (scale.x(x) * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
+        def correlation(x: Float[Numbers, "n dx"]) -> Float[Array, "d n m"]:
+            at, known = (scale.x(a).astype(jnp.float64) for a in (x, problem.x))
+            return prior.correlation(at, known, problem.gap_relevance)
 
         def init(key: PRNGKeyArray) -> State:
             found = identified(self.sysid, setting, problem, key, self.particles)
-            known = scaled(problem.x)
             left = jnp.asarray(problem.y) - simulated(found.phi, problem.x)
-            correlation = gram(kernel, known, known)
-            data = weighted_spectra(correlation, left, problem.m, problem.weights, None, kappa, white)
+            among = correlation(problem.x)
+            data = weighted_spectra(among, left, problem.m, weights, None, kappa, white)
             telling = data
             if problem.tells is not None:
-                telling = weighted_spectra(correlation, left, problem.m, problem.weights, problem.tells, kappa, white)
+                telling = weighted_spectra(among, left, problem.m, weights, problem.tells, kappa, white)
             prior_std = self.noise.prior_std if self.noise.learn else None
             # of rows that count by their weights both are in the spectra already
-            scales, left_over = (kappa, white) if problem.weights is None else (jnp.ones_like(kappa), 0.0)
+            scales, left_over = (kappa, white) if weights is None else (jnp.ones_like(kappa), 0.0)
             best = best_scales(telling, scales, left_over, prior_std, problem.noise_floor, problem.noise_init)
             return State(
                 found,
@@ -113,12 +115,12 @@ class ExactGP:
 
         def predicted(state: State, x: Float[Array, "n dx"]) -> tuple[Float[Array, "n dy"], Float[Array, "n dy"]]:
             """Mean and standard deviation of what the simulator leaves, normalised."""
-            known, data = gram(kernel, scaled(x), scaled(problem.x)) * counts[None], state.data
-            if problem.weights is None:  # one basis serves all outputs
-                values, reach, turned, own = data.values, known @ data.vectors, data.turned.T, None
+            known, data = correlation(x) * counts[None, None], state.data
+            if weights is None:  # one basis serves all outputs
+                values, reach, turned, own = data.values, known[0] @ data.vectors, data.turned.T, None
             else:
-                roots = jnp.sqrt(jnp.asarray(problem.weights).astype(jnp.float64)).T
-                reach = jax.vmap(lambda root, vectors: (known * root[None]) @ vectors)(roots, data.vectors)
+                roots = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
+                reach = (known * roots[:, None]) @ data.vectors
                 values, turned, own = data.values, data.turned[..., 0], 0
 
             def of_output(
@@ -128,7 +130,7 @@ class ExactGP:
                 reach: Float[Array, "n m"],
                 turned: Float[Array, " m"],
             ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-                known = kappa**2 * values + white if problem.weights is None else values
+                known = kappa**2 * values + white if weights is None else values
                 total = known + sigma.astype(jnp.float64) ** 2
                 taken = kappa**4 * jnp.sum(reach**2 / total[None], axis=1)
                 std = jnp.sqrt(jnp.maximum(kappa**2 - taken, 0.0) + white)

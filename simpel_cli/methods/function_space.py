@@ -162,7 +162,8 @@ class FunctionSpace(ABC):
             key: PRNGKeyArray, x: Float[Array, "k dx"], samples: Float[Array, "k dy N"]
         ) -> tuple[Score, Basis | None]:
             """Score of the prior on a set, and the basis of its covariance, per output."""
-            covariance = setting.prior.covariance(x, problem.gap_scale)
+            own = () if problem.gap_relevance is None else (problem.gap_relevance,)
+            covariance = setting.prior.covariance(x, problem.gap_scale, *own)
             whole = None
             if self.precondition:
                 drawn = jnp.transpose(samples, (1, 2, 0))

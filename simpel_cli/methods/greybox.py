@@ -97,7 +97,9 @@ class GreyBox:
         own = Setting(bound, Gaussian(), setting.sample_inputs)
         ones, y_std = jnp.ones(problem.y.shape[1:], dtype), jnp.asarray(scale.y_std)
         # what is left has mean zero, not that of the targets
-        frame = problem._replace(gap_scale=ones, bank=None, normaliser=scale._replace(y_mean=0 * y_std))
+        frame = problem._replace(
+            gap_scale=ones, gap_relevance=None, bank=None, normaliser=scale._replace(y_mean=0 * y_std)
+        )
 
         def simulated(phi: Float[Array, " dp"], x: Float[Numbers, "n dx"]) -> Float[Array, "n dy"]:
             """Data units."""
@@ -126,7 +128,7 @@ class GreyBox:
             prior_std = noise.prior_std if noise.learn else None
             weights = None if problem.weights is None else jnp.asarray(problem.weights)[rows]
             tells = None if problem.tells is None else jnp.asarray(problem.tells)[rows]
-            spectra = weighted_spectra(correlation(1.0), y, m, weights, tells)
+            spectra = weighted_spectra(correlation(1.0)[None], y, m, weights, tells)
             best = best_scales(spectra, kappa, 0.0, prior_std, floor, init)
             if not floors:
                 return best.scale.astype(dtype), jnp.asarray(floor)

@@ -29,7 +29,7 @@ from simpel_cli.inference.protocols import Inference, Info, Problem, Setting
 from simpel_cli.methods import particle_networks as nets
 from simpel_cli.methods.particle_networks import Networks, refuse_rates
 from simpel_cli.priors.function_prior import FunctionPrior
-from simpel_cli.priors.gaussian_process import Spectral, gram
+from simpel_cli.priors.gaussian_process import Spectral
 from simpel_cli.priors.marginal_likelihood import MOST_ROWS, Spectrum, best_scales, evenly
 
 LEAST_DRAWS = 64  # that a covariance is worth taking of
@@ -140,8 +140,7 @@ class Pathwise:
                 return jnp.zeros((len(x), dim_y, self.particles + 2), dtype)
             return (draws - scale.y_mean[None, :, None]) / scale.y_std[None, :, None]
 
-        def scaled(x: Float[Array, "n dx"]) -> Float[Array, "n dx"]:
-            return (x * jnp.asarray(prior.input_scale, dtype)[None]).astype(jnp.float64)
+        relevance = jnp.asarray(prior.input_scale)[None] if problem.gap_relevance is None else problem.gap_relevance
 
         def prior_paths(
             key: PRNGKeyArray, x: Float[Array, "n dx"], draws: Float[Array, "n dy N"]
@@ -154,10 +153,19 @@ class Pathwise:
             assert isinstance(prior.kernel, Spectral)
             frequency = prior.kernel.frequencies(key_frequency, self.features, x.shape[1])
             phase = jax.random.uniform(key_phase, (self.features,), jnp.float64, 0, 2 * jnp.pi)
-            wave = jnp.sqrt(2 / self.features) * jnp.cos(scaled(x) @ frequency.T + phase[None])
             weights = self._paired(key_weight, (self.features, dim_y))
-            # the one large product of a stretch: single precision is enough for a path
-            gap = jnp.einsum("nf,lfd->ndl", wave.astype(dtype), weights.astype(dtype))
+
+            def paths(relevance: Float[Array, " dx"], weights: Float[Array, "L f *d"]) -> Float[Array, "n *d L"]:
+                at = (x * relevance.astype(dtype)[None]).astype(jnp.float64)
+                wave = jnp.sqrt(2 / self.features) * jnp.cos(at @ frequency.T + phase[None])
+                # the one large product of a stretch: single precision is enough for a path
+                return jnp.moveaxis(jnp.tensordot(wave.astype(dtype), weights.astype(dtype), ((1,), (1,))), 1, -1)
+
+            if len(relevance) == 1:
+                gap = paths(relevance[0], weights)
+            else:
+                each = jax.lax.map(lambda own: paths(*own), (relevance, jnp.moveaxis(weights, -1, 0)))
+                gap = jnp.moveaxis(each, 0, 1)
             return own + kappa[None, :, None] * gap.astype(jnp.float64)
 
         def centred(draws: Float[Array, "n dy N"]) -> Float[Array, "dy n R"]:
@@ -171,7 +179,7 @@ class Pathwise:
             """Noise of the largest marginal likelihood, normalised."""
             few, _ = evenly(len(rows), count, MOST_ROWS)
             left = (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
-            correlation = correlations(known[few], known[few])
+            among = correlations(known[few], known[few])
 
             def of_output(
                 given: tuple[
@@ -181,9 +189,10 @@ class Pathwise:
                     Float[Array, ""],
                     Float[Array, ""],
                     Float[Array, " c"],
+                    Float[Array, "c c"],
                 ],
             ) -> Float[Array, ""]:
-                own, left, kappa, floor, typical, root = given
+                own, left, kappa, floor, typical, root, correlation = given
                 # rows count by their weights; those that tell nothing of the noise are left out, as padding is
                 real, left = root * counts[few], root * left
                 known = own @ own.T + kappa**2 * correlation + white * jnp.eye(len(left), dtype=jnp.float64)
@@ -199,14 +208,24 @@ class Pathwise:
             floor, typical = (jnp.asarray(a).astype(jnp.float64) for a in (problem.noise_floor, problem.noise_init))
             found: Array = jax.lax.map(
                 of_output,
-                (draws[:, few], left.T, kappa, floor, typical, (jnp.sqrt(weights) * tells.astype(jnp.float64))[few].T),
+                (
+                    draws[:, few],
+                    left.T,
+                    kappa,
+                    floor,
+                    typical,
+                    (jnp.sqrt(weights) * tells.astype(jnp.float64))[few].T,
+                    among,
+                ),
             )
             return found
 
-        def correlations(x: Float[Array, "n dx"], other: Float[Array, "c dx"]) -> Float[Array, "n c"]:
+        def correlations(x: Float[Array, "n dx"], other: Float[Array, "c dx"]) -> Float[Array, "dy n c"]:
+            size = (dim_y, len(x), len(other))
             if prior.kernel is None:
-                return jnp.zeros((len(x), len(other)), jnp.float64)
-            return gram(prior.kernel, scaled(x), scaled(other))
+                return jnp.zeros(size, jnp.float64)
+            found = prior.correlation(x.astype(jnp.float64), other.astype(jnp.float64), relevance)
+            return jnp.broadcast_to(found, size)
 
         def init(key: PRNGKeyArray) -> State:
             key_paths, key_noise, key_networks = jax.random.split(key, 3)
@@ -222,14 +241,18 @@ class Pathwise:
             noise = self._paired(key_noise, (len(rows), dim_y)) * jnp.sqrt(variance)[None]
             seen = measured[:, :, None] + jnp.moveaxis(noise, 0, -1)
             left = (seen - before) * counts[:, None, None]
-            correlation = correlations(known, known)
 
             def of_output(
                 given: tuple[
-                    Float[Array, "c N"], Float[Array, "c L"], Float[Array, "c L"], Float[Array, ""], Float[Array, " c"]
+                    Float[Array, "c N"],
+                    Float[Array, "c L"],
+                    Float[Array, "c L"],
+                    Float[Array, ""],
+                    Float[Array, " c"],
+                    Float[Array, "c c"],
                 ],
             ) -> tuple[Float[Array, "N L"], Float[Array, "c L"], Float[Array, "c L"]]:
-                own, seen, left, kappa, variance = given
+                own, seen, left, kappa, variance, correlation = given
                 own = own * counts[:, None]
                 law = own @ own.T + kappa**2 * correlation * counts[:, None] * counts[None]
                 factor = jnp.linalg.cholesky(law + jnp.diag(variance))
@@ -237,7 +260,7 @@ class Pathwise:
                 return own.T @ solved, kappa**2 * solved, seen - variance[:, None] * solved
 
             seen, left = jnp.moveaxis(seen, 1, 0), jnp.moveaxis(left, 1, 0)
-            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance.T))
+            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance.T, correlations(known, known)))
             total = jnp.sqrt(common).astype(dtype)
             rho = self.noise.init(total, problem.noise_floor)
             first = networks.init(key_networks)._replace(noise=rho)
@@ -253,7 +276,7 @@ class Pathwise:
             draws = simulated(key_draws, points, n_rows + jnp.arange(len(points), dtype=rows.dtype))
             fresh = scale.x(points)
             moved = jnp.einsum("dnj,djl->ndl", centred(draws), paths.along)
-            moved = moved + jnp.einsum("nc,dcl->ndl", correlations(fresh, known), paths.at)
+            moved = moved + jnp.einsum("dnc,dcl->ndl", correlations(fresh, known), paths.at)
             elsewhere = prior_paths(key_gap, fresh, draws) + moved
             h = jnp.concatenate([elsewhere, jnp.moveaxis(paths.known, 0, 1)])
             return Targets(jnp.concatenate([fresh, known]), jnp.moveaxis(h, -1, 0).astype(dtype))

@@ -33,15 +33,16 @@ class GapGP:
 
     Args:
         kernel: correlation function.
-        lengthscale: in normalised inputs (unit variance on the domain), or in data units; null = 2 sqrt(dx) normalised.
-        lengthscale_units: `normalised` or `raw`.
+        lengthscale: `auto`: one per input and output, by the marginal likelihood of the training transitions, about
+            2 sqrt(dx); null: that, in normalised inputs (unit variance on the domain); or a number.
+        lengthscale_units: of the number, `normalised` or `raw`: data units.
         scale: kappa, the standard deviation per output. `auto` maximises the marginal likelihood of the training
             transitions; `declared` takes `gap:` of the simulator, and `auto` for what it leaves out; a number is a
             fraction of the outputs' normalising standard deviation.
     """
 
     kernel: Kernel = SquaredExponential()
-    lengthscale: float | None = None
+    lengthscale: float | str | None = None
     lengthscale_units: str = "normalised"
     scale: float | str = "auto"
 
@@ -50,12 +51,21 @@ class GapGP:
             raise ConfigError(
                 f"prior.gap.lengthscale_units: got {self.lengthscale_units!r}; allowed are normalised and raw."
             )
-        if self.lengthscale is not None and not self.lengthscale > 0:
-            raise ConfigError(f"prior.gap.lengthscale: got {self.lengthscale}; it must be positive (or null).")
+        if isinstance(self.lengthscale, str) and self.lengthscale != "auto":
+            raise ConfigError(
+                f"prior.gap.lengthscale: got {self.lengthscale!r}; allowed are auto, null and a positive number."
+            )
+        if self.lengthscale is not None and not self.learns_lengthscales and not float(self.lengthscale) > 0:
+            raise ConfigError(f"prior.gap.lengthscale: got {self.lengthscale}; it must be positive (or auto, or null).")
         if isinstance(self.scale, str) and self.scale not in ("declared", "auto"):
             raise ConfigError(f"prior.gap.scale: got {self.scale!r}; allowed are declared, auto and a number >= 0.")
         if not isinstance(self.scale, str) and not self.scale >= 0:
             raise ConfigError(f"prior.gap.scale: got {self.scale}; a number must be >= 0 (0 switches the gap off).")
+
+    @property
+    def learns_lengthscales(self) -> bool:
+        """Whether the training transitions choose the lengthscales."""
+        return self.lengthscale == "auto"
 
 
 class FunctionPrior(NamedTuple):
@@ -116,14 +126,42 @@ class FunctionPrior(NamedTuple):
             return jax.vmap(run)(over)
         return jax.lax.map(run, over, batch_size=min(max(1, CACHED // (self.width * copies)), over.shape[0]))
 
-    def covariance(self, x: Float[Array, "M dx"], scale: Float[Array | np.ndarray, " dy"]) -> Float[Array, "dy M M"]:
-        """Covariance of the Gaussian part; the correlation matrix is shared by the outputs."""
+    def covariance(
+        self,
+        x: Float[Array, "M dx"],
+        scale: Float[Array | np.ndarray, " dy"],
+        relevance: Float[Array | np.ndarray, "dy dx"] | None = None,
+    ) -> Float[Array, "dy M M"]:
+        """Covariance of the Gaussian part.
+
+        Args:
+            x: normalised inputs.
+            scale: kappa.
+            relevance: see `correlation`.
+        """
         white = self.white_variance * jnp.eye(x.shape[0], dtype=x.dtype)
         if self.kernel is None:
             return jnp.broadcast_to(white[None], (self.dim_y, *white.shape))
-        scaled = x * jnp.asarray(self.input_scale, x.dtype)[None]
         variance = jnp.asarray(scale) ** 2
-        return variance[:, None, None] * gram(self.kernel, scaled, scaled)[None] + white[None]
+        return variance[:, None, None] * self.correlation(x, x, relevance) + white[None]
+
+    def correlation(
+        self,
+        x: Float[Array, "n dx"],
+        other: Float[Array, "c dx"],
+        relevance: Float[Array | np.ndarray, "dy dx"] | None = None,
+    ) -> Float[Array, "d n c"]:
+        """Correlation of the gap between normalised inputs: one that all outputs share (d = 1), or each its own (d = dy).
+
+        Args:
+            x: inputs.
+            other: inputs.
+            relevance: of every input to every output, one over its lengthscale; None: `input_scale`.
+        """
+        assert self.kernel is not None
+        kernel = self.kernel
+        each = jnp.asarray(self.input_scale)[None] if relevance is None else jnp.asarray(relevance)
+        return jax.vmap(lambda own: gram(kernel, x * own[None], other * own[None]))(each.astype(x.dtype))
 
 
 @dataclass(frozen=True)
@@ -223,7 +261,9 @@ def instead_of_lost(draws: Array | np.ndarray, reach: np.ndarray | float) -> Arr
 
 
 def _input_scale(gap: GapGP, x_std: Float[Array | np.ndarray, " dx"]) -> Float[Array | np.ndarray, " dx"]:
-    lengthscale = gap.lengthscale if gap.lengthscale is not None else 2.0 * len(x_std) ** 0.5
+    if gap.lengthscale is None or isinstance(gap.lengthscale, str):
+        return np.full(len(x_std), 0.5 / len(x_std) ** 0.5)
+    lengthscale = gap.lengthscale
     return x_std / lengthscale if gap.lengthscale_units == "raw" else np.full(len(x_std), 1 / lengthscale)
 
 

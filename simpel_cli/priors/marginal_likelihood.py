@@ -72,7 +72,7 @@ def spectrum(correlation: Float[Array, "m m"], residual: Float[Array, "m dy"], r
 
 
 def weighted_spectra(
-    correlation: Float[Array, "m m"],
+    correlation: Float[Array, "d m m"],
     residual: Float[Array, "m dy"],
     rows: Int[Numbers, ""],
     weights: Float[Numbers, "m dy"] | None,
@@ -84,24 +84,29 @@ def weighted_spectra(
 
     Rows and columns times the roots of the weights: N(0, K + sigma^2 W^-1) becomes N(0, W^1/2 K W^1/2 + sigma^2 I). Where
     `tells` is 0 a row is left out, as padding is. With weights and `kappa` K is kappa^2 times the correlation, with `white` on
-    its diagonal: what is no noise is not divided by the weights.
+    its diagonal: what is no noise is not divided by the weights. The correlation is one that all outputs share (d = 1),
+    or, with weights, each has its own (d = dy).
     """
     if weights is None:
-        return spectrum(correlation, residual, rows)
-    correlation = correlation.astype(jnp.float64)
+        return spectrum(correlation[0], residual, rows)
+    correlation = jnp.broadcast_to(correlation.astype(jnp.float64), (residual.shape[1], *correlation.shape[1:]))
     root = jnp.sqrt(jnp.asarray(weights).astype(jnp.float64)).T
     if tells is not None:
         root = root * jnp.asarray(tells).astype(jnp.float64).T
     real = (jnp.arange(len(residual), dtype=jnp.int32) < rows).astype(jnp.float64)
 
-    def of_output(root: Float[Array, " m"], left: Float[Array, " m"], kappa: Float[Array, ""]) -> Spectrum:
+    def of_output(
+        root: Float[Array, " m"], left: Float[Array, " m"], kappa: Float[Array, ""], correlation: Float[Array, "m m"]
+    ) -> Spectrum:
         known = kappa**2 * correlation + white * jnp.eye(len(root), dtype=jnp.float64)
         found = spectrum(known * root[:, None] * root[None], (left * root)[:, None], rows)
         silent = jnp.sum(jnp.where(root > 0, 0.0, real))
         return found._replace(padding=found.padding + silent)
 
     scale = jnp.ones(len(root), jnp.float64) if kappa is None else kappa
-    found: Spectrum = jax.lax.map(lambda given: of_output(*given), (root, residual.astype(jnp.float64).T, scale))
+    found: Spectrum = jax.lax.map(
+        lambda given: of_output(*given), (root, residual.astype(jnp.float64).T, scale, correlation)
+    )
     return found
 
 
@@ -190,7 +195,7 @@ def noise_of_smooth(
     left = jnp.asarray(residual)
     found = [
         best_scales(
-            weighted_spectra(correlation(f), left, rows, weights, tells), None, white, prior_std, floor, typical
+            weighted_spectra(correlation(f)[None], left, rows, weights, tells), None, white, prior_std, floor, typical
         )
         for f in LONGER
     ]

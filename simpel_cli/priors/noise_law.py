@@ -51,7 +51,7 @@ class Moments(NamedTuple):
 
     Args:
         samples: draws of the simulator, (N, m, dy).
-        correlation: of the gap, (m, m).
+        correlation: of the gap, (m, m), or of every output's, (dy, m, m).
         targets: measured, (m, dy).
         white: white model error of the prior, a variance.
         precision: how much each target counts, its noise has the variance sigma^2/precision, (m, dy); None: all alike.
@@ -64,6 +64,10 @@ class Moments(NamedTuple):
     white: float
     precision: np.ndarray | None = None
     tells: np.ndarray | None = None
+
+    def correlation_of(self, i: int) -> np.ndarray:
+        """Return the correlation of the gap of an output, (m, m)."""
+        return self.correlation if self.correlation.ndim == 2 else self.correlation[i]
 
     def rows(self, i: int) -> np.ndarray:
         """Return the rows that tell of an output's noise; of none, all of them."""
@@ -81,7 +85,7 @@ class Moments(NamedTuple):
         """Return samples (N, m'), correlation (m', m') and targets (m',) of `rows`, in units in which all count alike."""
         rows = self.rows(i)
         root = np.ones(len(rows)) if self.precision is None else np.sqrt(self.precision[rows, i])
-        correlation = self.correlation[np.ix_(rows, rows)] * np.outer(root, root)
+        correlation = self.correlation_of(i)[np.ix_(rows, rows)] * np.outer(root, root)
         return self.samples[:, rows, i] * root[None], correlation, self.targets[rows, i] * root
 
     def white_of(self, i: int) -> np.ndarray:

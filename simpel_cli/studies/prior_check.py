@@ -28,5 +28,5 @@ def prior_check(study: Study, fitted: Fitted) -> PriorCheck | None:
     gap_scale = None if study.prior.gap is None else problem.gap_scale
     return check_prior(
         study.system, fitted.assembled.setting, fitted.normaliser, x, y, study.recording.noise_std, gap_scale,
-        stream(0, "prior_predictive"), bank, relative,
+        stream(0, "prior_predictive"), bank, relative, problem.gap_relevance,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from simpel_cli.studies.prepare import Fitted
 
 LOG_EVERY = 50  # steps per row of the metric table
 # of a problem: drawn or chosen, not measured
-DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor", "tail", "weights", "noise_rms")
+DRAWN = ("normaliser", "gap_scale", "noise_init", "noise_floor", "tail", "weights", "noise_rms", "gap_relevance")
 
 
 def train(

@@ -1,7 +1,7 @@
 """The published reference's own arrays (SIMPEL_SHARED/reference) as learning problems of this project.
 
 Simulators: pendulum_published; rc_car, the kinematic bicycle, with the action three steps old as its input, as the arrays
-have it. Gap GP l = 10 raw, N = 1028, L = 20, 3 x 64, 24 + 16 points, the reference's number of steps.
+have it. N = 1028, L = 20, 3 x 64, 24 + 16 points, the reference's number of steps.
 """
 
 from functools import partial
@@ -75,13 +75,13 @@ def node(group: str, name: str) -> dict[str, Any]:
     return {k: v for k, v in resolved.items() if k != "defaults"}
 
 
-def prior_of(method: str, scale: str | float, draws: int) -> SimulatorPrior | GPPrior:
-    """Return the prior that the method's YAML chooses, with the published gap."""
+def prior_of(method: str, scale: str | float, draws: int, lengthscale: str | float) -> SimulatorPrior | GPPrior:
+    """Return the prior that the method's YAML chooses; lengthscale of the gap: auto, or a number in data units."""
     chosen = yaml.safe_load((conf_dir() / "method" / f"{method}.yaml").read_text())["defaults"][0]
     (name,) = chosen.values()
     if name == "gp":
         return build(node("prior", "gp"), "prior")
-    gap = GapGP(lengthscale=10.0, lengthscale_units="raw", scale=scale) if name == "simulator" else None
+    gap = GapGP(lengthscale=lengthscale, lengthscale_units="raw", scale=scale) if name == "simulator" else None
     return SimulatorPrior(gap=gap, draws=draws)
 
 
@@ -107,6 +107,7 @@ def case(
     *,
     seeds: int = 1,
     scale: str | float = "auto",
+    lengthscale: str | float = "auto",
     draws: int = 1028,
     rows: int | None = None,
     fields: dict[str, Any] | None = None,
@@ -119,6 +120,7 @@ def case(
         method, score: names of their YAML.
         seeds: number of them.
         scale: kappa of the gap: declared, auto or a number.
+        lengthscale: of the gap: auto or a number in data units; the published one is 10.
         draws: N of the simulator.
         rows: training rows, drawn with repeats from those of the set (to time other sizes); None: as they are.
         fields: of the method.
@@ -134,8 +136,8 @@ def case(
         chosen = np.random.default_rng(0).integers(0, len(x), rows)
         x, y = x[chosen], y[chosen]
     assembled = assemble(
-        system, normaliser, prior_of(method, scale, draws), build(node("score", score), "score"), [Training(x, y)] * seeds,
-        NOISE[kind], NOISE[kind] if kind == "pendulum" else {}, noise=rule.noise, pool=rule.pool,
+        system, normaliser, prior_of(method, scale, draws, lengthscale), build(node("score", score), "score"),
+        [Training(x, y)] * seeds, NOISE[kind], NOISE[kind] if kind == "pendulum" else {}, noise=rule.noise, pool=rule.pool,
         keys=[stream(s, "prior") for s in range(seeds)], precision="float32", law=law,
     )  # fmt: skip
     return Case(rule, assembled, normaliser, jnp.stack([stream(s, "train") for s in range(seeds)]), arrays)
