@@ -14,7 +14,7 @@ from simpel_cli.inference.protocols import Method
 from simpel_cli.reporting.figures import draw_run
 from simpel_cli.reporting.html import figure, write_report
 from simpel_cli.reporting.prior_check import describe_prior
-from simpel_cli.reporting.run_table import law_of_noise, named_method, run_table
+from simpel_cli.reporting.run_table import law_of_noise, lengthscales, named_method, run_table
 from simpel_cli.runs.console import Terminal, aligned
 from simpel_cli.runs.directory import typed
 from simpel_cli.runs.manifest import Manifest
@@ -87,10 +87,9 @@ def _gap_text(study: Study, fitted: Fitted) -> str:
     if gap is None or fitted.assembled.gap_scale is None:
         return "no gap GP"
     words = "".join(f" {c.lower()}" if c.isupper() else c for c in type(gap.kernel).__name__).strip()
-    length = gap.lengthscale if gap.lengthscale is not None else 2 * study.system.encoding.dim_x**0.5
     scale = " ".join(f"{v:.2g}" for v in fitted.assembled.gap_scale)
     what = "gap GP" if study.prior.uses_simulator else "GP prior, no simulator"
-    return f"{what}: {words}, length scale {length:.3g}, scale kappa {scale}"
+    return f"{what}: {words}, lengthscales {lengthscales(study, fitted)}, scale kappa {scale}"
 
 
 def describe_evaluation(terminal: Terminal, run: Path, step: int, study: Study, judged_on: Study) -> None:

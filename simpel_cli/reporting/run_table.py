@@ -31,6 +31,7 @@ def run_table(study: Study, fitted: Fitted, judged: Judged, manifest: Manifest) 
         ("training", f"{used} of {fitted.available} {'transitions' if study.system.source.states else 'rows'}"),
         ("seeds", ", ".join(map(str, seeds))),
         ("gap scale kappa", _kappa(study, fitted)),
+        ("gap lengthscales", lengthscales(study, fitted)),
         ("distinct particles", _distinct(study, judged.distinct)),
         ("learned noise", _per_output(study, judged.noise_std)),
         ("law of the noise", law_of_noise(study, fitted)),
@@ -56,6 +57,22 @@ def _kappa(study: Study, fitted: Fitted) -> str:
         return "no gap GP"
     scale = np.asarray(fitted.assembled.problems.gap_scale, dtype=float)
     return _per_output(study, scale * fitted.target_std)
+
+
+def lengthscales(study: Study, fitted: Fitted) -> str:
+    """Return the lengthscales of the gap: the number that was declared, or from the shortest to the longest of every output."""
+    gap, relevance = study.prior.gap, fitted.assembled.problems.gap_relevance
+    if gap is None:
+        return "no gap GP"
+    if relevance is None:
+        if gap.lengthscale is None:
+            return f"{2 * study.system.encoding.dim_x**0.5:.3g}"
+        return f"{gap.lengthscale:.3g}" + (" in data units" if gap.lengthscale_units == "raw" else "")
+    each = 1 / np.asarray(relevance, dtype=float)
+    names = study.system.encoding.y_names
+    low, high = each.min(axis=(0, 2)), each.max(axis=(0, 2))
+    shown = [f"{name} {a:.2g} to {b:.2g}" for name, a, b in zip(names, low, high, strict=True)]
+    return ", ".join(shown) + " of an input's standard deviation over the domain"
 
 
 def law_of_noise(study: Study, fitted: Fitted) -> str:
