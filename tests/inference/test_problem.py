@@ -273,6 +273,35 @@ def test_no_network_learns_less_noise_than_the_prior_leaves(prior, gap):
     assert floor(SCALE_POINTS + 1) == pytest.approx(1e-3)  # so many rows teach the noise themselves
 
 
+@pytest.mark.parametrize("heavy", [False, True], ids=["Gaussian", "Student's t"])
+def test_lengthscales_are_short_along_what_the_simulator_misses_and_long_along_what_it_has(heavy):
+    system = system_of(declared(), (), 0)
+    normaliser = normaliser_of(system, KEY)
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (100, 1)), rng.uniform(-2, 2, (100, 1))
+    noise = NOISY * (rng.standard_t(3, states.shape) if heavy else rng.normal(size=states.shape))
+    y = exact(states, inputs, np.ones(states.shape)) - states + (0.5 * np.cos(4 * states) + noise) * normaliser.y_std
+
+    def relevance(lengthscale):
+        done = assemble(
+            system, normaliser, SimulatorPrior(GapGP(lengthscale=lengthscale)), Gaussian(),
+            [Training(system.encoding.to_x(states, inputs), y)], {}, {}, noise=NoiseModel(), pool=16, keys=[KEY],
+            precision="float32", law="student_t" if heavy else "gaussian",
+        ).problems  # fmt: skip
+        assert (done.tail is None) != heavy
+        return done.gap_relevance
+
+    along_state, along_input = 1 / relevance("auto")[0, 0]
+    assert 0.2 < along_state < 1.0
+    assert along_input > 4 * along_state
+    assert relevance(None) is relevance(2.0) is None
+
+
+def test_of_no_data_the_lengthscales_are_those_that_are_declared():
+    problems = assembled(system_of(declared(), (), 0), SimulatorPrior(GapGP(lengthscale="auto")), n=0)[1].problems
+    np.testing.assert_allclose(problems.gap_relevance, 0.5 / problems.x.shape[-1] ** 0.5)
+
+
 @pytest.mark.parametrize(("prior", "asked"), [(SimulatorPrior(), True), (GPPrior(scale="auto"), False)])
 def test_a_world_is_asked_for_the_scales_at_few_points_and_for_a_gp_not_at_all(prior, asked):
     sizes = []

@@ -160,6 +160,24 @@ def test_a_wide_simulator_a_few_draws_at_a_time_is_the_same_simulator() -> None:
     np.testing.assert_allclose(one, other, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "method", [ExactGP(SysID(noise=FIXED)), FSVGD(steps=20, **FEW), Pathwise(steps=20, **SMALL, features=50)]
+)
+def test_lengthscales_of_the_problem_stand_in_place_of_those_of_the_prior(method: Any) -> None:
+    """The same posterior as under a prior that declares them, and another one than under the prior's own."""
+    prior = prior_of(gap=True)._replace(draws=200)
+    problem = problem_of(1.3 * X - 0.4 + 0.5 * np.sin(3 * X), kappa=0.5)
+
+    def mean(prior: FunctionPrior, relevance: float | None) -> np.ndarray:
+        own = problem if relevance is None else problem._replace(gap_relevance=jnp.array([[relevance]]))
+        rule = method.bind(setting_of(prior), own)
+        return np.asarray(rule.predict(run(rule, method.steps), jnp.asarray(GRID)).mean)
+
+    declared = mean(prior._replace(input_scale=np.array([3.0])), None)
+    np.testing.assert_allclose(mean(prior, 3.0), declared, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(mean(prior, None), declared, rtol=1e-3, atol=1e-4)
+
+
 def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     y = 1.3 * X - 0.4 + 0.5 * np.sin(3 * X) + NOISE * RANDOM.normal(size=X.shape)
     method = ExactGP(sysid=SysID(noise=FIXED), particles=50)

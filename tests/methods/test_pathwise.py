@@ -60,9 +60,11 @@ def test_paths_have_mean_and_covariance_of_the_posterior() -> None:
     np.testing.assert_allclose(np.cov(h.T), spread, atol=0.03 * spread.max() + 0.002)
 
 
-def test_paths_of_two_outputs_in_units_of_their_own() -> None:
-    """Normalisers, scales of the gap, a lengthscale and a white model error that are not 1, 0 and nothing."""
-    white, reach, kappas = 0.02, 2.0, np.array([0.5, 0.2])
+@pytest.mark.parametrize("relevance", [None, np.array([[2.0], [0.7]])], ids=["declared", "chosen"])
+def test_paths_of_two_outputs_in_units_of_their_own(relevance: np.ndarray | None) -> None:
+    """Normalisers, scales of the gap, lengthscales and a white model error that are not 1, 0 and nothing."""
+    white, kappas = 0.02, np.array([0.5, 0.2])
+    reach = [2.0, 2.0] if relevance is None else relevance[:, 0].tolist()
     scale = Normaliser(np.array([0.5]), np.array([2.0]), np.array([3.0, -1.0]), np.array([2.0, 0.5]))
 
     def two(x: jax.Array, phi: jax.Array) -> jax.Array:
@@ -72,8 +74,9 @@ def test_paths_of_two_outputs_in_units_of_their_own() -> None:
     pad = padded_length(len(X))
     problem = jax.tree.map(jnp.asarray, Problem(
         pad_rows(X, pad), pad_rows(y, pad), np.array(len(X), np.int32), scale, kappas, np.full(2, NOISE), np.full(2, 1e-3),
+        gap_relevance=relevance,
     ))  # fmt: skip
-    prior = FunctionPrior(7000, white, SquaredExponential(), np.full(1, reach), PARAMS, two, 1, 2)
+    prior = FunctionPrior(7000, white, SquaredExponential(), np.full(1, 2.0), PARAMS, two, 1, 2)
     rule = MANY.bind(setting_of(prior), problem)
     state, targets = drawn(rule)
     at = 0.5 + 2.0 * np.asarray(targets.x)[: 32 + len(X)]  # data units
@@ -82,7 +85,7 @@ def test_paths_of_two_outputs_in_units_of_their_own() -> None:
 
     def of(a: np.ndarray, b: np.ndarray, i: int) -> np.ndarray:
         draws = (3.0 * a @ b.T + 0.25) / 4 if i == 0 else a @ b.T
-        return draws + kappas[i] ** 2 * oracles.squared_exponential(a[:, 0] / 2 * reach, b[:, 0] / 2 * reach, 1.0)
+        return draws + kappas[i] ** 2 * oracles.squared_exponential(a[:, 0] / 2 * reach[i], b[:, 0] / 2 * reach[i], 1.0)
 
     for i, centre in enumerate((-1.5, 2.0)):
         mean, spread = oracles.gp_posterior(of(X, X, i), of(at, X, i), of(at, at, i), y[:, i] - centre, total)

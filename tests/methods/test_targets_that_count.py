@@ -162,7 +162,7 @@ def test_nor_in_the_marginal_likelihood_of_the_noise() -> None:
     assert 0.3 * KAPPA < free.gap < 2 * KAPPA
     problem = counting(problem_of(y, KAPPA), COUNTS, np.ones(N))
     spectra = weighted_spectra(
-        jnp.asarray(np.pad(law / KAPPA**2, (0, problem.x.shape[0] - N))), problem.y, problem.m, problem.weights, None,
+        jnp.asarray(np.pad(law / KAPPA**2, (0, problem.x.shape[0] - N)))[None], problem.y, problem.m, problem.weights, None,
         problem.gap_scale, MODEL_ERROR,
     )  # fmt: skip
     best = best_scales(spectra, jnp.ones(1), 0.0, 1.0, np.full(1, 0.01), np.full(1, 0.3))

@@ -83,7 +83,7 @@ def test_every_output_has_its_own_correlation() -> None:
     relevance = np.array([[1.0, 0.1], [0.2, 3.0]])
     covariance = np.asarray(prior.covariance(x, np.array([0.5, 2.0]), relevance))
     for i, kappa in enumerate((0.5, 2.0)):
-        own = gram(SquaredExponential(), x * relevance[i], x * relevance[i])
+        own = gram(SquaredExponential(), *2 * [jnp.asarray(np.asarray(x) * relevance[i])])
         np.testing.assert_allclose(covariance[i], kappa**2 * np.asarray(own) + 1e-4 * np.eye(5), rtol=1e-6)
     same = prior.covariance(x, np.array([0.5, 2.0]), np.full((2, 2), 0.5))
     np.testing.assert_allclose(prior.covariance(x, np.array([0.5, 2.0])), same, rtol=1e-6)
