@@ -170,8 +170,10 @@ class PriorProcess(Protocol):
         """Draw the simulator part at inputs in data units; data units out."""
         ...
 
-    def covariance(self, x: Float[Array, "M dx"], scale: Float[Numbers, " dy"]) -> Float[Array, "dy M M"]:
-        """Covariance of the Gaussian part at normalised inputs, in normalised output units."""
+    def covariance(
+        self, x: Float[Array, "M dx"], scale: Float[Numbers, " dy"], relevance: Float[Numbers, "dy dx"] | None = None
+    ) -> Float[Array, "dy M M"]:
+        """Covariance of the Gaussian part at normalised inputs, in normalised output units; relevance: `gap_relevance`."""
         ...
 
 

@@ -103,6 +103,9 @@ class Chooser(NamedTuple):
             return None
         at, found = self.normalised(x), []
         for i, own in enumerate(declared):
+            if given[i] == 0:  # there is no gap
+                found.append(own)
+                continue
             rows = moments.rows(i)
             counts = multiplied(moments.precision, weights)
             white = np.full(len(rows), 0.0 if weights is not None else moments.white)

@@ -162,8 +162,7 @@ class FunctionSpace(ABC):
             key: PRNGKeyArray, x: Float[Array, "k dx"], samples: Float[Array, "k dy N"]
         ) -> tuple[Score, Basis | None]:
             """Score of the prior on a set, and the basis of its covariance, per output."""
-            own = () if problem.gap_relevance is None else (problem.gap_relevance,)
-            covariance = setting.prior.covariance(x, problem.gap_scale, *own)
+            covariance = setting.prior.covariance(x, problem.gap_scale, problem.gap_relevance)
             whole = None
             if self.precondition:
                 drawn = jnp.transpose(samples, (1, 2, 0))

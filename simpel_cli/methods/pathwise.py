@@ -140,7 +140,9 @@ class Pathwise:
                 return jnp.zeros((len(x), dim_y, self.particles + 2), dtype)
             return (draws - scale.y_mean[None, :, None]) / scale.y_std[None, :, None]
 
-        relevance = jnp.asarray(prior.input_scale)[None] if problem.gap_relevance is None else problem.gap_relevance
+        shared = problem.gap_relevance is None
+        relevance = jnp.asarray(prior.input_scale)[None] if shared else jnp.asarray(problem.gap_relevance)
+        of_each = jnp.broadcast_to(relevance, (dim_y, relevance.shape[1]))
 
         def prior_paths(
             key: PRNGKeyArray, x: Float[Array, "n dx"], draws: Float[Array, "n dy N"]
@@ -161,7 +163,7 @@ class Pathwise:
                 # the one large product of a stretch: single precision is enough for a path
                 return jnp.moveaxis(jnp.tensordot(wave.astype(dtype), weights.astype(dtype), ((1,), (1,))), 1, -1)
 
-            if len(relevance) == 1:
+            if shared:
                 gap = paths(relevance[0], weights)
             else:
                 each = jax.lax.map(lambda own: paths(*own), (relevance, jnp.moveaxis(weights, -1, 0)))
@@ -179,7 +181,6 @@ class Pathwise:
             """Noise of the largest marginal likelihood, normalised."""
             few, _ = evenly(len(rows), count, MOST_ROWS)
             left = (jnp.asarray(problem.y)[rows].astype(jnp.float64) - mean)[few]
-            among = correlations(known[few], known[few])
 
             def of_output(
                 given: tuple[
@@ -189,14 +190,15 @@ class Pathwise:
                     Float[Array, ""],
                     Float[Array, ""],
                     Float[Array, " c"],
-                    Float[Array, "c c"],
+                    Float[Array, " dx"],
                 ],
             ) -> Float[Array, ""]:
-                own, left, kappa, floor, typical, root, correlation = given
+                own, left, kappa, floor, typical, root, relevance = given
+                correlation = correlations(known[few], known[few], relevance)
                 # rows count by their weights; those that tell nothing of the noise are left out, as padding is
                 real, left = root * counts[few], root * left
-                known = own @ own.T + kappa**2 * correlation + white * jnp.eye(len(left), dtype=jnp.float64)
-                law = known * real[:, None] * real[None]
+                function = own @ own.T + kappa**2 * correlation + white * jnp.eye(len(left), dtype=jnp.float64)
+                law = function * real[:, None] * real[None]
                 values, vectors = jnp.linalg.eigh(law)
                 turned = vectors.T @ (left * counts[few])[:, None]
                 silent = jnp.sum(jnp.where(real > 0, 0.0, 1.0))
@@ -215,17 +217,17 @@ class Pathwise:
                     floor,
                     typical,
                     (jnp.sqrt(weights) * tells.astype(jnp.float64))[few].T,
-                    among,
+                    of_each,
                 ),
             )
             return found
 
-        def correlations(x: Float[Array, "n dx"], other: Float[Array, "c dx"]) -> Float[Array, "dy n c"]:
-            size = (dim_y, len(x), len(other))
+        def correlations(
+            x: Float[Array, "n dx"], other: Float[Array, "c dx"], relevance: Float[Numbers, " dx"]
+        ) -> Float[Array, "n c"]:
             if prior.kernel is None:
-                return jnp.zeros(size, jnp.float64)
-            found = prior.correlation(x.astype(jnp.float64), other.astype(jnp.float64), relevance)
-            return jnp.broadcast_to(found, size)
+                return jnp.zeros((len(x), len(other)), jnp.float64)
+            return prior.correlation(x.astype(jnp.float64), other.astype(jnp.float64), relevance[None])[0]
 
         def init(key: PRNGKeyArray) -> State:
             key_paths, key_noise, key_networks = jax.random.split(key, 3)
@@ -249,10 +251,11 @@ class Pathwise:
                     Float[Array, "c L"],
                     Float[Array, ""],
                     Float[Array, " c"],
-                    Float[Array, "c c"],
+                    Float[Array, " dx"],
                 ],
             ) -> tuple[Float[Array, "N L"], Float[Array, "c L"], Float[Array, "c L"]]:
-                own, seen, left, kappa, variance, correlation = given
+                own, seen, left, kappa, variance, relevance = given
+                correlation = correlations(known, known, relevance)
                 own = own * counts[:, None]
                 law = own @ own.T + kappa**2 * correlation * counts[:, None] * counts[None]
                 factor = jnp.linalg.cholesky(law + jnp.diag(variance))
@@ -260,7 +263,7 @@ class Pathwise:
                 return own.T @ solved, kappa**2 * solved, seen - variance[:, None] * solved
 
             seen, left = jnp.moveaxis(seen, 1, 0), jnp.moveaxis(left, 1, 0)
-            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance.T, correlations(known, known)))
+            along, at, values = jax.lax.map(of_output, (own, seen, left, kappa, variance.T, of_each))
             total = jnp.sqrt(common).astype(dtype)
             rho = self.noise.init(total, problem.noise_floor)
             first = networks.init(key_networks)._replace(noise=rho)
@@ -276,7 +279,11 @@ class Pathwise:
             draws = simulated(key_draws, points, n_rows + jnp.arange(len(points), dtype=rows.dtype))
             fresh = scale.x(points)
             moved = jnp.einsum("dnj,djl->ndl", centred(draws), paths.along)
-            moved = moved + jnp.einsum("dnc,dcl->ndl", correlations(fresh, known), paths.at)
+            if shared:
+                by_gap = jnp.einsum("nc,dcl->dnl", correlations(fresh, known, relevance[0]), paths.at)
+            else:
+                by_gap = jax.lax.map(lambda own: correlations(fresh, known, own[0]) @ own[1], (of_each, paths.at))
+            moved = moved + jnp.moveaxis(by_gap, 0, 1)
             elsewhere = prior_paths(key_gap, fresh, draws) + moved
             h = jnp.concatenate([elsewhere, jnp.moveaxis(paths.known, 0, 1)])
             return Targets(jnp.concatenate([fresh, known]), jnp.moveaxis(h, -1, 0).astype(dtype))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from simpel_cli.dynamics.encoding import Encoding
 from simpel_cli.dynamics.transition import OneStep, Transition
 from simpel_cli.errors import ConfigError
-from simpel_cli.priors.gaussian_process import Kernel, SquaredExponential, gram
+from simpel_cli.priors.gaussian_process import Kernel, SquaredExponential, grams
 from simpel_cli.runs.settings import current_device
 from simulators.model import Quantity
 
@@ -42,7 +42,7 @@ class GapGP:
     """
 
     kernel: Kernel = SquaredExponential()
-    lengthscale: float | str | None = None
+    lengthscale: float | str | None = "auto"
     lengthscale_units: str = "normalised"
     scale: float | str = "auto"
 
@@ -159,9 +159,8 @@ class FunctionPrior(NamedTuple):
             relevance: of every input to every output, one over its lengthscale; None: `input_scale`.
         """
         assert self.kernel is not None
-        kernel = self.kernel
         each = jnp.asarray(self.input_scale)[None] if relevance is None else jnp.asarray(relevance)
-        return jax.vmap(lambda own: gram(kernel, x * own[None], other * own[None]))(each.astype(x.dtype))
+        return grams(self.kernel, x, other, each.astype(x.dtype))
 
 
 @dataclass(frozen=True)
@@ -217,6 +216,8 @@ class GPPrior:
     def __post_init__(self) -> None:
         if isinstance(self.scale, str) and self.scale != "auto":
             raise ConfigError(f"prior.scale: got {self.scale!r}; allowed are auto and a positive number.")
+        if isinstance(self.lengthscale, str):
+            raise ConfigError(f"prior.lengthscale: got {self.lengthscale!r}; it must be a positive number.")
         for name in ("lengthscale", "scale", "white_variance"):
             value = getattr(self, name)
             if not isinstance(value, str) and not value > 0:

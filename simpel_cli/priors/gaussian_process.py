@@ -6,6 +6,7 @@ Reference: Rasmussen and Williams (2006), eqs. 4.9, 4.17, 2.25-2.26.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import jax
@@ -93,6 +94,17 @@ def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[A
 def gram(kernel: Kernel, a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
     """Return the correlation matrix of inputs that are already divided by the lengthscale."""
     return kernel.correlation(squared_distances(a, b))
+
+
+@partial(jax.jit, static_argnums=0)
+def grams(
+    kernel: Kernel, a: Float[Array, "n d"], b: Float[Array, "m d"], relevance: Float[Array, "p d"]
+) -> Float[Array, "p n m"]:
+    """Return the correlation matrices of inputs under each of several vectors of relevances, one over the lengthscales.
+
+    Compiled, the differences of all inputs are never in memory.
+    """
+    return jax.vmap(lambda own: gram(kernel, a * own[None], b * own[None]))(relevance)
 
 
 def posterior(

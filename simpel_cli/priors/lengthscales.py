@@ -5,6 +5,7 @@
 with inputs x normalised and relevances r_d = 1/l_d. How fast what the simulator lacks varies with a speed or a command
 differs from plant to plant by a factor of ten, and one length for all inputs makes it vary as fast with those that play no
 part. Their logarithms have the prior N(log r0, 1 + 2^2 1 1'): all of them may well be longer or shorter, one of them a little.
+Where they gain little they stay as they are declared: a gap that is white noise explains noise as well as the noise does.
 
 Reference: Rasmussen and Williams (2006), eqs. 5.1, 5.8 and 5.9 (automatic relevance determination; gradient).
 """
@@ -26,6 +27,7 @@ TOGETHER, APART = 2.0, 1.0  # standard deviations of a logarithm: of all of them
 FURTHEST = 4.0  # from where it is declared: a factor of 55
 STARTS = (0.0, 0.1), (0.7, 0.5), (1.4, 0.03)  # logarithm of the relevances over the declared ones, and kappa
 ROUNDS = 60  # of L-BFGS, from each
+LEAST_GAIN = 3.0, 0.25  # nats that they have to be ahead of the declared ones by: in any case, and per input
 
 
 def most_likely(
@@ -79,18 +81,23 @@ def most_likely(
         value = fit + off @ (off / [8, 2]) + theta[2:] @ away / 2
         return value, np.concatenate([np.array([along_gap, along_noise]) + off / [4, 1], along + away])
 
-    fixed = BOUNDS if gap is None else (np.log(gap), np.log(gap))
-    bounds = [fixed, BOUNDS, *[(-FURTHEST, FURTHEST)] * size]
-    found = [
-        minimize(
-            objective,
-            np.concatenate([[np.log(kappa if gap is None else gap), np.log(noise_init)], np.full(size, shorter)]),
-            bounds=bounds, method="L-BFGS-B", jac=True, options={"maxiter": ROUNDS},
-        )
-        for shorter, kappa in STARTS
-    ]  # fmt: skip
-    best: np.ndarray = min(found, key=lambda r: float(r.fun)).x
-    return declared * np.exp(best[2:])
+    def best_within(furthest: float) -> tuple[float, np.ndarray]:
+        """The least loss, and where, with logarithms no further than that from the declared ones."""
+        fixed = BOUNDS if gap is None else (np.log(gap), np.log(gap))
+        bounds = [fixed, BOUNDS, *[(-furthest, furthest)] * size]
+        found = []
+        for shorter, kappa in STARTS:
+            scales = np.log([kappa if gap is None else gap, noise_init])
+            start = np.concatenate([scales, np.full(size, min(shorter, furthest))])
+            found.append(
+                minimize(objective, start, bounds=bounds, method="L-BFGS-B", jac=True, options={"maxiter": ROUNDS})
+            )
+        least = min(found, key=lambda r: float(r.fun))
+        return float(least.fun), least.x
+
+    before, _ = best_within(0.0)
+    after, best = best_within(FURTHEST)
+    return declared * np.exp(best[2:]) if before - after > LEAST_GAIN[0] + LEAST_GAIN[1] * size else declared
 
 
 @partial(jax.jit, static_argnums=0)

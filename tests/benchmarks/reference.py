@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.reference --sets pendulum_n20_s0 --methods simpel --seeds 1
 
-All methods take the same networks, noise treatment, prior weight, data and steps (`tests.benchmarks.arrays`). Scale and
-lengthscales of the gap are chosen by marginal likelihood unless --gap-scale and --lengthscale say otherwise (the published
-lengthscale is 10). Intervals: 95 %, Student's t over seeds.
+All methods take the same networks, noise treatment, prior weight, data and steps (`tests.benchmarks.arrays`). The scale of
+the gap is chosen by marginal likelihood unless --gap-scale says otherwise; its lengthscale is the published one for every
+method, unless --lengthscale is auto or another number. Intervals: 95 %, Student's t over seeds.
 """
 
 import argparse
@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--gap-scale", default="auto", type=scale_of, help="declared, auto or a number")
     parser.add_argument(
-        "--lengthscale", default="auto", type=scale_of, help="of the gap: auto, or a number in data units"
+        "--lengthscale", default=10.0, type=scale_of, help="of the gap: auto, or a number in data units"
     )
     parser.add_argument("--law", choices=LAWS, default="auto", help="of the noise")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=JSON", help="fields of the method")

@@ -55,7 +55,7 @@ def drawn(study: Study, fitted: Fitted, replicas: int) -> Drawn:
     x = np.concatenate([fitted.training[0][0], x_test[rows]])
     scale = problem.normaliser
     at = jnp.asarray((x - scale.x_mean) / scale.x_std)
-    known = np.asarray(fitted.assembled.setting.prior.covariance(at, jnp.asarray(problem.gap_scale)), float)
+    known = np.asarray(fitted.assembled.setting.prior.covariance(at, problem.gap_scale, problem.gap_relevance), float)
     factor = np.linalg.cholesky(known + 1e-10 * np.eye(len(x)))
     normal = np.random.default_rng(0).normal(size=(replicas, len(x), len(known)))
     gap = np.einsum("dij,rjd->rid", factor, normal) * scale.y_std
@@ -73,8 +73,11 @@ def particles(study: Study, fitted: Fitted, given: Drawn) -> np.ndarray:
         study.measurements.noise_std, noise=study.method.noise, pool=study.method.pool,
         keys=[stream(r, "prior") for r in range(replicas)], precision=study.settings.precision,
     )  # fmt: skip
-    kappa = fitted.assembled.problems.gap_scale[0]
-    problems = assembled.problems._replace(gap_scale=jnp.tile(kappa[None], (replicas, 1)))
+    own = fitted.assembled.problems
+    same = {
+        k: a if a is None else jnp.repeat(a[:1], replicas, 0) for k, a in own._asdict().items() if k.startswith("gap_")
+    }
+    problems = assembled.problems._replace(**same)
     bind = partial(study.method.bind, assembled.setting)
     program = loop.compiled(bind, problems, jnp.stack([stream(r, "train") for r in range(replicas)]), STRETCH)
     *_, last = loop.train(program, study.method.steps)

@@ -297,6 +297,13 @@ def test_lengthscales_are_short_along_what_the_simulator_misses_and_long_along_w
     assert relevance(None) is relevance(2.0) is None
 
 
+def test_an_output_without_a_gap_keeps_the_declared_lengthscales():
+    prior = SimulatorPrior(GapGP(lengthscale="auto", scale=0.0))
+    problems = assembled(system_of(declared(), (), 0), prior, n=30)[1].problems
+    np.testing.assert_allclose(problems.gap_relevance, 0.5 / problems.x.shape[-1] ** 0.5)
+    assert np.all(np.asarray(problems.gap_scale) == 0)
+
+
 def test_of_no_data_the_lengthscales_are_those_that_are_declared():
     problems = assembled(system_of(declared(), (), 0), SimulatorPrior(GapGP(lengthscale="auto")), n=0)[1].problems
     np.testing.assert_allclose(problems.gap_relevance, 0.5 / problems.x.shape[-1] ** 0.5)

@@ -40,7 +40,7 @@ def test_the_gradient_is_that_of_finite_differences(kernel: Kernel, gap: float |
     seen = []
 
     def looked(objective: Any, start: np.ndarray, **options: Any) -> Any:
-        at = start + 0.1 * np.arange(len(start))
+        at = start + 0.1 * np.arange(len(start))  # beyond bounds, too
         step = 1e-5 * np.eye(len(at))
         seen.append((objective(at)[1], [(objective(at + s)[0] - objective(at - s)[0]) / 2e-5 for s in step]))
         return original(objective, start, **options)
@@ -50,14 +50,24 @@ def test_the_gradient_is_that_of_finite_differences(kernel: Kernel, gap: float |
     random = np.random.default_rng(1)
     samples, weights = random.normal(size=(9, 1)) * x[:, 1], random.uniform(0.3, 1, 15)
     most_likely(kernel, x, samples, y, np.full(15, 1e-4), DECLARED, 0.05, gap, weights)
-    assert len(seen) == 3
+    assert len(seen) == 6
     for own, differences in seen:
         np.testing.assert_allclose(own, differences, rtol=1e-5, atol=1e-5)
 
 
 def test_few_data_leave_them_where_they_are_declared() -> None:
-    x, y = planted(2)
-    np.testing.assert_allclose(found(x, 0.01 * y) * DECLARED, 1, rtol=0.5)
+    np.testing.assert_allclose(found(*planted(3)) * DECLARED, 1)
+
+
+@pytest.mark.parametrize("size", [6, 12])
+def test_noise_alone_leaves_them_where_they_are_declared(size: int) -> None:
+    """A gap that is white noise explains noise as well as the noise does."""
+    declared = np.full(size, 0.5 / size**0.5)
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        x, y = random.uniform(-1.7, 1.7, (150, size)), 0.1 * random.normal(size=150)
+        given = SquaredExponential(), x, np.zeros((2, 150)), y, np.full(150, 1e-6), declared, 0.1
+        np.testing.assert_array_equal(most_likely(*given), declared)
 
 
 def test_a_row_that_hardly_counts_does_not_bend_the_gap() -> None:
