@@ -60,7 +60,10 @@ def _kappa(study: Study, fitted: Fitted) -> str:
 
 
 def lengthscales(study: Study, fitted: Fitted) -> str:
-    """Return the lengthscales of the gap: the number that was declared, or from the shortest to the longest of every output."""
+    """Return the lengthscales of the gap, in standard deviations of an input over the domain.
+
+    The number that was declared, or, where they were chosen, from the shortest to the longest of every output.
+    """
     gap, relevance = study.prior.gap, fitted.assembled.problems.gap_relevance
     if gap is None:
         return "no gap GP"
@@ -71,8 +74,10 @@ def lengthscales(study: Study, fitted: Fitted) -> str:
     each = 1 / np.asarray(relevance, dtype=float)
     names = study.system.encoding.y_names
     low, high = each.min(axis=(0, 2)), each.max(axis=(0, 2))
-    shown = [f"{name} {a:.2g} to {b:.2g}" for name, a, b in zip(names, low, high, strict=True)]
-    return ", ".join(shown) + " of an input's standard deviation over the domain"
+    if low.min() == high.max():
+        return f"{low[0]:.3g}"
+    shown = zip(names, (f"{a:.2g}" for a in low), (f"{b:.2g}" for b in high), strict=True)
+    return ", ".join(f"{name} {a}" + ("" if a == b else f" to {b}") for name, a, b in shown)
 
 
 def law_of_noise(study: Study, fitted: Fitted) -> str:
