@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from simpel_cli.inference.assemble import Assembled
+from simpel_cli.priors.function_prior import GapGP
 from simpel_cli.runs.manifest import Manifest, versions
 from simpel_cli.studies.judgement import Judged
 from simpel_cli.studies.open import Study
@@ -60,21 +61,29 @@ def _kappa(study: Study, fitted: Fitted) -> str:
 
 
 def lengthscales(study: Study, fitted: Fitted) -> str:
+    """Return the lengthscales of the gap of a fit."""
+    relevance, encoding = fitted.assembled.problems.gap_relevance, study.system.encoding
+    each = None if relevance is None else 1 / np.asarray(relevance, dtype=float)
+    return lengthscales_in_words(study.prior.gap, each, encoding.y_names, encoding.dim_x)
+
+
+def lengthscales_in_words(gap: GapGP | None, chosen: np.ndarray | None, names: Sequence[str], dim_x: int) -> str:
     """Return the lengthscales of the gap, in standard deviations of an input over the domain.
 
-    The number that was declared, or, where they were chosen, from the shortest to the longest of every output.
+    Args:
+        gap: as declared.
+        chosen: of every seed, output and input; None: what was declared holds.
+        names: of the outputs.
+        dim_x: number of inputs.
     """
-    gap, relevance = study.prior.gap, fitted.assembled.problems.gap_relevance
     if gap is None:
         return "no gap GP"
-    if relevance is None:
+    if chosen is None:
         if gap.lengthscale is None:
-            return f"{2 * study.system.encoding.dim_x**0.5:.3g}"
+            return f"{2 * dim_x**0.5:.3g}"
         return f"{gap.lengthscale:.3g}" + (" in data units" if gap.lengthscale_units == "raw" else "")
-    each = 1 / np.asarray(relevance, dtype=float)
-    names = study.system.encoding.y_names
-    low, high = each.min(axis=(0, 2)), each.max(axis=(0, 2))
-    if low.min() == high.max():
+    low, high = chosen.min(axis=(0, 2)), chosen.max(axis=(0, 2))
+    if np.allclose(low.min(), high.max()):
         return f"{low[0]:.3g}"
     shown = zip(names, (f"{a:.2g}" for a in low), (f"{b:.2g}" for b in high), strict=True)
     return ", ".join(f"{name} {a}" + ("" if a == b else f" to {b}") for name, a, b in shown)

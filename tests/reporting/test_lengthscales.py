@@ -1,20 +1,14 @@
 """What the report says of the gap's lengthscales."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
 from simpel_cli.priors.function_prior import GapGP
-from simpel_cli.reporting.run_table import lengthscales
+from simpel_cli.reporting.run_table import lengthscales_in_words
 
 
-def said(gap: GapGP | None, relevance: Any = None) -> str:
-    encoding = SimpleNamespace(y_names=("v", "omega"), dim_x=4)
-    study: Any = SimpleNamespace(prior=SimpleNamespace(gap=gap), system=SimpleNamespace(encoding=encoding))
-    fitted: Any = SimpleNamespace(assembled=SimpleNamespace(problems=SimpleNamespace(gap_relevance=relevance)))
-    return lengthscales(study, fitted)
+def said(gap: GapGP | None, chosen: np.ndarray | None = None) -> str:
+    return lengthscales_in_words(gap, chosen, ("v", "omega"), 4)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +25,6 @@ def test_what_was_declared(gap: GapGP | None, words: str) -> None:
 
 
 def test_what_was_chosen_is_from_the_shortest_to_the_longest_of_all_seeds() -> None:
-    chosen = 1 / np.array([[[4.0, 4.0], [0.5, 20.0]], [[4.0, 4.0], [0.4, 10.0]]])
+    chosen = np.array([[[4.0, 4.0], [0.5, 20.0]], [[4.0, 4.0], [0.4, 10.0]]])
     assert said(GapGP(), chosen) == "v 4, omega 0.4 to 20"
-    assert said(GapGP(), np.full((2, 2, 2), 0.25)) == "4"
+    assert said(GapGP(), np.full((2, 2, 2), 4.0)) == "4"
