@@ -42,7 +42,7 @@ class GapGP:
     """
 
     kernel: Kernel = SquaredExponential()
-    lengthscale: float | str | None = "auto"
+    lengthscale: float | str | None = None
     lengthscale_units: str = "normalised"
     scale: float | str = "auto"
 
