@@ -79,7 +79,8 @@ def kernel_between(flat: Float[Array, "L d"], bandwidth: float | str) -> tuple[F
     squared = jnp.sum((flat[:, None, :] - flat[None, :, :]) ** 2, axis=-1)
     if isinstance(bandwidth, str):
         typical = jnp.median(squared[jnp.triu_indices(n, 1)]) if n > 1 else jnp.ones((), flat.dtype)
-        width_squared = jnp.maximum(typical, jnp.finfo(flat.dtype).tiny) / (2 * log(2))
+        # particles that are all alike have none: any width will do
+        width_squared = jnp.where(typical > 0, typical, 1.0) / (2 * log(2))
     else:
         width_squared = jnp.asarray(bandwidth**2, flat.dtype)
     return jnp.exp(-0.5 * squared / width_squared), width_squared

@@ -127,3 +127,13 @@ def test_distinct_rows_are_distinct_and_uniform(size: int, m: int) -> None:
 def test_of_too_few_rows_each_counts_once() -> None:
     rows, counts = distinct_rows(jax.random.key(0), 5, jnp.asarray(3))
     assert np.asarray(rows)[np.asarray(counts)].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("bandwidth", ["median", 2.0])
+def test_particles_that_are_alike_move_alike(bandwidth: Any) -> None:
+    from simpel_cli.methods.repulsive import Repulsive
+
+    h = jnp.full((4, 3), 0.1)
+    for velocity, near in (stein_velocity(h, -h, bandwidth), Repulsive(bandwidth=bandwidth).velocity(h, -h)):
+        assert near == 1
+        np.testing.assert_allclose(velocity, -h, rtol=1e-5)
