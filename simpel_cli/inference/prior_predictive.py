@@ -122,9 +122,8 @@ def check_prior(
     noise = measurement_noise(system, x, noise_std, key, None if relative is None else relative[rows]) / y_std
     at = jnp.asarray((x - normaliser.x_mean) / normaliser.x_std, jnp.float64)
     scale = np.zeros(y.shape[1]) if gap_scale is None else np.asarray(gap_scale, float)
-    known = np.asarray(
-        setting.prior.covariance(at, jnp.asarray(scale), gap_relevance), float
-    )  # with the white model error
+    # with the white model error
+    known = np.asarray(setting.prior.covariance(at, jnp.asarray(scale), gap_relevance), float)
     white = known[:, 0, 0] - scale**2
     # one row among all of them lies further out with probability SURPRISING
     wider = ndtri(1 - SURPRISING / (2 * targets.size))

@@ -127,8 +127,6 @@ class Chooser(NamedTuple):
             samples = (drawn - self.normaliser.y_mean) / self.normaliser.y_std
         white = self.prior.white_variance
         correlation = self.correlation(x, relevance=relevance)
-        if len(correlation) == 1:
-            correlation = correlation[0]
         return Moments(samples, correlation, targets, white, training.precision, training.tells)
 
 

@@ -140,7 +140,7 @@ class Pathwise:
                 return jnp.zeros((len(x), dim_y, self.particles + 2), dtype)
             return (draws - scale.y_mean[None, :, None]) / scale.y_std[None, :, None]
 
-        shared = problem.gap_relevance is None
+        shared = problem.gap_relevance is None  # features and kernel of all outputs are one: a share 1/dy of the work
         relevance = jnp.asarray(prior.input_scale)[None] if shared else jnp.asarray(problem.gap_relevance)
         of_each = jnp.broadcast_to(relevance, (dim_y, relevance.shape[1]))
 

@@ -17,6 +17,49 @@ BOUNDS = float(np.log(1e-3)), float(np.log(10.0))  # of log kappa and log sigma
 LEVELS = 41
 
 
+class Loss(NamedTuple):
+    """Minus the logarithm of the penalised marginal likelihood of one output, up to a constant.
+
+    Args:
+        value: of the loss.
+        slope: along log kappa and log sigma, (2,).
+        against: kappa^2 [A^-1 - A^-1 e e' A^-1], (m, m): the loss changes by half of its sum with a change of the correlation.
+    """
+
+    value: float
+    slope: np.ndarray
+    against: np.ndarray
+
+
+def penalised(
+    theta: np.ndarray,
+    known: np.ndarray,
+    correlation: np.ndarray,
+    variance: np.ndarray,
+    residual: np.ndarray,
+    noise_init: float,
+) -> Loss:
+    """Return the loss for y ~ N(mean, A), A = known + kappa^2 correlation + sigma^2 diag(variance).
+
+    Args:
+        theta: log kappa and log sigma, whose priors are N(log 0.1, 2^2) and N(log noise_init, 1).
+        known: covariance of all else, (m, m).
+        correlation: of the gap, (m, m).
+        variance: of the noise of every row, for sigma = 1, (m,).
+        residual: y less its mean, e, (m,).
+        noise_init: typical noise.
+    """
+    kappa2, sigma2 = np.exp(2 * theta)
+    factor = cho_factor(known + kappa2 * correlation + np.diag(sigma2 * variance), lower=True)
+    inverse = cho_solve(factor, np.eye(len(residual)))
+    pull = inverse @ residual
+    fit = residual @ pull / 2 + np.log(np.diag(factor[0])).sum()
+    against = inverse - np.outer(pull, pull)
+    slope = np.array([kappa2 * np.sum(against * correlation), sigma2 * np.sum(np.diag(against) * variance)])
+    off = theta - np.log([0.1, noise_init])
+    return Loss(float(fit + off @ (off / [8, 2])), slope + off / [4, 1], kappa2 * against)
+
+
 class Scales(NamedTuple):
     """Standard deviations of the gap and of the noise of one output, normalised."""
 
@@ -50,18 +93,10 @@ def marginal_likelihood_scales(
     covariance = np.atleast_2d(np.cov(samples, rowvar=False))
     if gap is not None:
         return Scales(gap, _noise(covariance + gap**2 * correlation, residual, noise_init, white_variance))
-    identity, white = np.eye(len(targets)), np.diag(np.broadcast_to(white_variance, len(targets)))
+    known = covariance + np.diag(np.broadcast_to(white_variance, len(targets)))
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        kappa2, sigma2 = np.exp(2 * theta)
-        factor = cho_factor(covariance + kappa2 * correlation + white + sigma2 * identity, lower=True)
-        inverse = cho_solve(factor, identity)
-        weights = inverse @ residual
-        fit = residual @ weights / 2 + np.log(np.diag(factor[0])).sum()
-        along_gap = kappa2 * (np.sum(inverse * correlation) - weights @ correlation @ weights)
-        along_noise = sigma2 * (np.trace(inverse) - weights @ weights)
-        off = theta - np.log([0.1, noise_init])
-        return fit + off @ (off / [8, 2]), np.array([along_gap, along_noise]) + off / [4, 1]
+        return penalised(theta, known, correlation, np.ones(len(targets)), residual, noise_init)[:2]
 
     # a small gap and much noise, or the other way round: there may be an optimum of each kind
     starts = [np.log([kappa, noise_init]) for kappa in (0.03, 0.3)]

@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from simpel_cli.priors.gap_scale import BOUNDS
+from simpel_cli.priors.gap_scale import BOUNDS, penalised
 from simpel_cli.priors.gaussian_process import Kernel
 
 MOST_ROWS = 192  # that are looked at: time grows as their third power
@@ -58,28 +57,18 @@ def most_likely(
     x, samples, targets, white = x[rows], samples[:, rows], targets[rows], white[rows]
     variance = np.ones(len(rows)) if weights is None else 1 / weights[rows]
     residual, covariance = targets - samples.mean(axis=0), np.atleast_2d(np.cov(samples, rowvar=False))
-    known, identity = covariance + np.diag(white), np.eye(len(rows))
-    size = x.shape[1]
+    known, size = covariance + np.diag(white), x.shape[1]
     spread = np.linalg.inv(APART**2 * np.eye(size) + TOGETHER**2 * np.ones((size, size)))
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        kappa2, sigma2 = np.exp(2 * theta[:2])
-        relevance = declared * np.exp(theta[2:])
-        scaled = x * relevance
+        scaled = x * declared * np.exp(theta[2:])
         correlation, slope = (np.asarray(a) for a in _correlation(kernel, scaled))
-        factor = cho_factor(known + kappa2 * correlation + np.diag(sigma2 * variance), lower=True)
-        inverse = cho_solve(factor, identity)
-        pull = inverse @ residual
-        fit = residual @ pull / 2 + np.log(np.diag(factor[0])).sum()
-        against = inverse - np.outer(pull, pull)
-        along_gap = kappa2 * np.sum(against * correlation)
-        along_noise = sigma2 * np.sum(np.diag(against) * variance)
+        loss = penalised(theta[:2], known, correlation, variance, residual, noise_init)
         # d rho(q_jk)/d log r_d = 2 rho'(q_jk) r_d^2 (x_jd - x_kd)^2, and both halves of the sum are alike
-        weight = kappa2 * against * slope
+        weight = loss.against * slope
         along = 2 * (weight.sum(axis=1) @ scaled**2 - np.sum(scaled * (weight @ scaled), axis=0))
-        off, away = theta[:2] - np.log([0.1, noise_init]), spread @ theta[2:]
-        value = fit + off @ (off / [8, 2]) + theta[2:] @ away / 2
-        return value, np.concatenate([np.array([along_gap, along_noise]) + off / [4, 1], along + away])
+        away = spread @ theta[2:]
+        return loss.value + theta[2:] @ away / 2, np.concatenate([loss.slope, along + away])
 
     def best_within(furthest: float) -> tuple[float, np.ndarray]:
         """The least loss, and where, with logarithms no further than that from the declared ones."""

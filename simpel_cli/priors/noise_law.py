@@ -51,7 +51,7 @@ class Moments(NamedTuple):
 
     Args:
         samples: draws of the simulator, (N, m, dy).
-        correlation: of the gap, (m, m), or of every output's, (dy, m, m).
+        correlation: of the gap, (d, m, m): of all outputs together, d = 1, or of each, d = dy.
         targets: measured, (m, dy).
         white: white model error of the prior, a variance.
         precision: how much each target counts, its noise has the variance sigma^2/precision, (m, dy); None: all alike.
@@ -67,7 +67,7 @@ class Moments(NamedTuple):
 
     def correlation_of(self, i: int) -> np.ndarray:
         """Return the correlation of the gap of an output, (m, m)."""
-        return self.correlation if self.correlation.ndim == 2 else self.correlation[i]
+        return self.correlation[min(i, len(self.correlation) - 1)]
 
     def rows(self, i: int) -> np.ndarray:
         """Return the rows that tell of an output's noise; of none, all of them."""

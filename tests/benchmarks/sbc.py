@@ -74,10 +74,10 @@ def particles(study: Study, fitted: Fitted, given: Drawn) -> np.ndarray:
         keys=[stream(r, "prior") for r in range(replicas)], precision=study.settings.precision,
     )  # fmt: skip
     own = fitted.assembled.problems
-    same = {
-        k: a if a is None else jnp.repeat(a[:1], replicas, 0) for k, a in own._asdict().items() if k.startswith("gap_")
-    }
-    problems = assembled.problems._replace(**same)
+    scale, relevance = (
+        None if a is None else jnp.repeat(a[:1], replicas, axis=0) for a in (own.gap_scale, own.gap_relevance)
+    )
+    problems = assembled.problems._replace(gap_scale=scale, gap_relevance=relevance)
     bind = partial(study.method.bind, assembled.setting)
     program = loop.compiled(bind, problems, jnp.stack([stream(r, "train") for r in range(replicas)]), STRETCH)
     *_, last = loop.train(program, study.method.steps)

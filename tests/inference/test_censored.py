@@ -125,6 +125,24 @@ def slope_and_offset(
     return (high - low) / 4, (high + low) / 2
 
 
+def test_sites_are_of_the_gap_whose_lengthscales_were_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The noise is known, and so is the gap's scale: only the lengthscale can make another target."""
+
+    def targets(relevance: float) -> np.ndarray:
+        monkeypatch.setattr("simpel_cli.inference.scales.most_likely", lambda *_: np.array([relevance]))
+        problems = assemble(
+            SYSTEM, NORMALISER, SimulatorPrior(gap=GapGP(scale=0.5, lengthscale="auto")), Gaussian(), [training(0, "ends")],
+            {"y": SIGMA}, {}, noise=NoiseModel(learn=False), pool=1, keys=[KEY], precision="float64", law="gaussian",
+        ).problems  # fmt: skip
+        return np.asarray(problems.y)
+
+    long, short = targets(0.1), targets(5.0)
+    at_ends = training(0, "ends").beyond != 0
+    moved = np.abs(long - short)[0, : len(at_ends)]
+    assert moved[at_ends].max() > 1e-3
+    assert moved[~at_ends].max() == 0
+
+
 @pytest.mark.parametrize(
     ("method", "gap", "steps"), [(SysID(starts=2), False, 40), (ExactGP(SysID(starts=2)), True, 1)], ids=["sysid", "gp"]
 )

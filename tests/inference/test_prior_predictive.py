@@ -45,10 +45,12 @@ def bound(gap: bool) -> tuple[System, Normaliser, Setting, np.ndarray | None]:
     return system, normaliser, assembled.setting, np.asarray(assembled.problems.gap_scale[0]) if gap else None
 
 
-def checked(y: np.ndarray, x: np.ndarray, gap: bool = True) -> PriorCheck:
+def checked(y: np.ndarray, x: np.ndarray, gap: bool = True, relevance: np.ndarray | None = None) -> PriorCheck:
     system, normaliser, setting, kappa = bound(gap)
     key = stream(0, "prior_predictive")
-    found = check_prior(system, setting, normaliser, x[:, None], y[:, None], {"f": NOISE}, kappa, key)
+    found = check_prior(
+        system, setting, normaliser, x[:, None], y[:, None], {"f": NOISE}, kappa, key, gap_relevance=relevance
+    )
     assert found is not None
     return found
 
@@ -103,6 +105,17 @@ def test_a_gap_explains_what_the_simulator_cannot(ramp: System) -> None:
     assert found.explained
     assert found.distance_with_gap is not None
     assert found.distance_with_gap < 2
+
+
+def test_a_gap_has_the_lengthscales_that_were_chosen(ramp: System) -> None:
+    x = np.linspace(-0.9, 0.9, 15)
+    y = np.tanh(x) + 0.3 * np.sin(8 * x)  # as fast as no gap of the declared lengthscale, 2
+    declared, same, chosen = (
+        checked(y, x, relevance=r).outputs[0] for r in (None, np.full((1, 1), 0.5), np.full((1, 1), 4.0))
+    )
+    assert declared.distance_with_gap == pytest.approx(same.distance_with_gap)
+    assert chosen.distance_with_gap < 0.5 * declared.distance_with_gap
+    assert chosen.distance == declared.distance
 
 
 def test_the_noise_of_the_state_that_a_step_starts_from_counts_as_the_simulator_makes_it() -> None:

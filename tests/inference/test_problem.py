@@ -297,6 +297,25 @@ def test_lengthscales_are_short_along_what_the_simulator_misses_and_long_along_w
     assert relevance(None) is relevance(2.0) is None
 
 
+@pytest.mark.parametrize(("law", "times"), [("gaussian", 2.0), ("student_t", 3.0)])
+def test_under_students_t_they_are_chosen_once_more_with_rows_that_count_by_their_weights(law, times, monkeypatch):
+    def by_weights(kernel, x, samples, targets, white, declared, noise_init, gap=None, weights=None):
+        assert (weights is None) == np.all(white > 0)  # Student's t holds the white model error
+        return declared * (2.0 if weights is None else 3.0)
+
+    monkeypatch.setattr("simpel_cli.inference.scales.most_likely", by_weights)
+    system = system_of(declared(), (), 0)
+    rng = np.random.default_rng(1)
+    states, inputs = rng.uniform(-1, 1, (30, 1)), rng.uniform(-2, 2, (30, 1))
+    y = exact(states, inputs, np.ones(states.shape)) - states + 0.1 * rng.normal(size=states.shape)
+    problems = assemble(
+        system, normaliser_of(system, KEY), SimulatorPrior(GapGP(lengthscale="auto")), Gaussian(),
+        [Training(system.encoding.to_x(states, inputs), y)], {}, {}, noise=NoiseModel(), pool=16, keys=[KEY],
+        precision="float32", law=law,
+    ).problems  # fmt: skip
+    np.testing.assert_allclose(problems.gap_relevance, times * 0.5 / problems.x.shape[-1] ** 0.5, rtol=1e-6)
+
+
 def test_an_output_without_a_gap_keeps_the_declared_lengthscales():
     prior = SimulatorPrior(GapGP(lengthscale="auto", scale=0.0))
     problems = assembled(system_of(declared(), (), 0), prior, n=30)[1].problems

@@ -178,6 +178,17 @@ def test_lengthscales_of_the_problem_stand_in_place_of_those_of_the_prior(method
     assert not np.allclose(mean(prior, None), declared, rtol=1e-3, atol=1e-4)
 
 
+def test_the_residual_of_greybox_has_the_lengthscale_of_its_own_prior() -> None:
+    """What was chosen for the simulator's gap is not for what an identified simulator leaves."""
+    method = GreyBox(SysID(steps=20, noise=FIXED), FSVGD(steps=10, **FEW), GPPrior(lengthscale=0.7))
+    problem = problem_of(1.3 * X - 0.4 + 0.5 * np.sin(3 * X))
+    plain, chosen = (
+        method.bind(setting_of(prior_of()), p) for p in (problem, problem._replace(gap_relevance=jnp.array([[9.0]])))
+    )
+    found = [rule.predict(run(rule, 10), jnp.asarray(GRID)).mean for rule in (plain, chosen)]
+    np.testing.assert_array_equal(*found)
+
+
 def test_exact_gp_is_the_textbook_posterior_about_the_identified_line() -> None:
     y = 1.3 * X - 0.4 + 0.5 * np.sin(3 * X) + NOISE * RANDOM.normal(size=X.shape)
     method = ExactGP(sysid=SysID(noise=FIXED), particles=50)

@@ -149,7 +149,7 @@ def test_nor_in_the_marginal_likelihood_of_the_noise() -> None:
     samples, counts = np.zeros((2, N, 1)), COUNTS[:, None]
     truth = law + np.diag(MODEL_ERROR + NOISE**2 / COUNTS)
     y = np.linalg.cholesky(truth) @ random.normal(size=(N, 1))
-    moments = Moments(samples, law / KAPPA**2, y, MODEL_ERROR, counts)
+    moments = Moments(samples, law[None] / KAPPA**2, y, MODEL_ERROR, counts)
     found = marginal_likelihood_scales(*moments.whitened(0), 0.3, moments.white_of(0), KAPPA).noise
     levels = np.geomspace(0.01, 1, 2001)
     minus = [
@@ -174,7 +174,7 @@ def test_moments_are_those_of_the_rows_that_tell() -> None:
     samples, targets = random.normal(size=(64, 8, 1)), random.normal(size=(8, 1))
     precision, tells = random.uniform(0.5, 2, (8, 1)), np.ones((8, 1))
     tells[[1, 4]] = 0
-    moments = Moments(samples, np.eye(8), targets, 0.0, precision, tells)
+    moments = Moments(samples, np.eye(8)[None], targets, 0.0, precision, tells)
     rows = [0, 2, 3, 5, 6, 7]
     root = np.sqrt(precision[rows, 0])
     covariance, residual = moments.of_output(0, 0.5)

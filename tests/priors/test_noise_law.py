@@ -17,7 +17,7 @@ def planted(rows: int, freedom: float | None, seed: int) -> Moments:
     smooth = KAPPA * root @ random.normal(size=(rows, OUTPUTS))
     shape = (rows, OUTPUTS)
     noise = random.normal(size=shape) if freedom is None else random.standard_t(freedom, shape)
-    return Moments(np.zeros((2, *shape)), correlation, smooth + SIGMA * noise, 1e-8)
+    return Moments(np.zeros((2, *shape)), correlation[None], smooth + SIGMA * noise, 1e-8)
 
 
 def gain(moments: Moments) -> float:

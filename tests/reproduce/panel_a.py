@@ -137,7 +137,7 @@ def fits(
         system = SETTINGS[setting][name]
         sim = name if setting == "informative" else f"{name}_published"
         for method in methods:
-            gap: tuple[str, ...] = ("prior.gap.lengthscale=null",) if method in ("simpel", "gp", "pathwise") else ()
+            gap: tuple[str, ...] = ()
             if setting == "published" and method in ("simpel", "gp", "pathwise"):
                 gap = ("prior.gap.scale=declared", "prior.gap.lengthscale=10", "prior.gap.lengthscale_units=raw")
             for n in system.small if small else system.sizes:
