@@ -75,8 +75,8 @@ def node(group: str, name: str) -> dict[str, Any]:
     return {k: v for k, v in resolved.items() if k != "defaults"}
 
 
-def prior_of(method: str, scale: str | float, draws: int, lengthscale: str | float) -> SimulatorPrior | GPPrior:
-    """Return the prior that the method's YAML chooses; lengthscale of the gap: auto, or a number in data units."""
+def prior_of(method: str, scale: str | float, draws: int, lengthscale: str | float | None) -> SimulatorPrior | GPPrior:
+    """Return the prior that the method's YAML chooses; lengthscale of the gap: auto, None, or a number in data units."""
     chosen = yaml.safe_load((conf_dir() / "method" / f"{method}.yaml").read_text())["defaults"][0]
     (name,) = chosen.values()
     if name == "gp":
@@ -107,7 +107,7 @@ def case(
     *,
     seeds: int = 1,
     scale: str | float = "auto",
-    lengthscale: str | float = 10.0,
+    lengthscale: str | float | None = 10.0,
     draws: int = 1028,
     rows: int | None = None,
     fields: dict[str, Any] | None = None,
@@ -120,7 +120,7 @@ def case(
         method, score: names of their YAML.
         seeds: number of them.
         scale: kappa of the gap: declared, auto or a number.
-        lengthscale: of the gap: auto or a number in data units; the published one by default, for every method.
+        lengthscale: of the gap: auto, None (2 sqrt(dx), normalised) or a number in data units; the published one by default.
         draws: N of the simulator.
         rows: training rows, drawn with repeats from those of the set (to time other sizes); None: as they are.
         fields: of the method.

@@ -4,7 +4,7 @@
 
 All methods take the same networks, noise treatment, prior weight, data and steps (`tests.benchmarks.arrays`). The scale of
 the gap is chosen by marginal likelihood unless --gap-scale says otherwise; its lengthscale is the published one for every
-method, unless --lengthscale is auto or another number. Intervals: 95 %, Student's t over seeds.
+method, unless --lengthscale is auto, null or another number. Intervals: 95 %, Student's t over seeds.
 """
 
 import argparse
@@ -32,6 +32,11 @@ KEYS = ("nll", "rmse", "crps", "coverage_90")
 def scale_of(word: str) -> str | float:
     """Return what a word on the command line says of the gap's scale."""
     return word if word in ("declared", "auto") else float(word)
+
+
+def lengthscale_of(word: str) -> str | float | None:
+    """Return what a word on the command line says of the gap's lengthscale."""
+    return {"null": None, "auto": "auto"}[word] if word in ("null", "auto") else float(word)
 
 
 def scored(given: Case) -> dict[str, Any]:
@@ -76,7 +81,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--gap-scale", default="auto", type=scale_of, help="declared, auto or a number")
     parser.add_argument(
-        "--lengthscale", default=10.0, type=scale_of, help="of the gap: auto, or a number in data units"
+        "--lengthscale", default=10.0, type=lengthscale_of, help="of the gap: auto, null, or a number in data units"
     )
     parser.add_argument("--law", choices=LAWS, default="auto", help="of the noise")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=JSON", help="fields of the method")
