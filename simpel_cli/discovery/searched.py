@@ -349,12 +349,11 @@ def _with(
             selection, gates = in_rows(simulated, by_simulations[0], search), by_simulations[1]
     outliers = outlier_check(found.clean, plan.augmented.measured)
     terminal.line(outliers.detail, "outliers")
-    levels = NoiseProfile(search, assessor, selection.chosen)
+    levels, alone_levels = (NoiseProfile(search, assessor, t) for t in (selection.chosen, selection.base))
     attach_said = partial(attach, saying(model, between_rows))
     # what simulations have chosen need not be worth anything one row ahead: no function may take its place there
     if by_simulations is None and not ground.budget.over("functions of two arguments"):
-        selection, gates = with_interactions(levels, selection, gates, attach_said, options, terminal)
-    alone_levels = NoiseProfile(search, assessor, selection.base)
+        selection, gates = with_interactions(levels, alone_levels, selection, gates, attach_said, options, terminal)
     alone = drifting(alone_levels, (BETWEEN,)) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:

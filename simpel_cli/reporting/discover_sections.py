@@ -276,7 +276,7 @@ def remainder_section(found: Mapping[str, Any]) -> Section:
     rms = rest.get("rms", np.nan)
     size = f", with a root mean square of {rms:.3g} {rest['unit']}" if np.isfinite(rms) else ""
     where = f"The model error in d({rest['acts_on']})/dt depends on {dependence(rest)}"
-    if not rest["depends_on"]:
+    if "parameter" in rest or not rest["depends_on"]:
         where = rest["description"][0].upper() + rest["description"][1:]
     return {
         "title": "Unexplained model error",

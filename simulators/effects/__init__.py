@@ -4,7 +4,7 @@ from simulators.effects.expression import Expression, Scales
 from simulators.effects.stores import stores_of, with_stores
 from simulators.effects.structure import Structure, structure
 from simulators.effects.term import EffectParameter, Store, Term
-from simulators.effects.unnamed import functions_of_two, unnamed
+from simulators.effects.unnamed import dependent, functions_of_two, unnamed
 
 __all__ = [
     "EffectParameter",
@@ -13,6 +13,7 @@ __all__ = [
     "Store",
     "Structure",
     "Term",
+    "dependent",
     "functions_of_two",
     "stores_of",
     "structure",

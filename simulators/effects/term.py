@@ -5,6 +5,7 @@ from typing import NamedTuple
 from simulators.groups import Grouping
 
 RATE, INPUT, SENSOR = "rate", "input", "sensor"  # adds to d(state)/dt; replaces an input; replaces a measured quantity
+PARAMETER = "parameter"  # adds to a parameter of the model or of another effect
 # operators on a signal, which no expression can state
 DELAY, LAG, BACKLASH, SENSOR_DELAY, SENSOR_LAG = "delay", "lag", "backlash", "sensor_delay", "sensor_lag"
 RATE_LIMIT = "rate_limit"  # the signal moves by one unit in so many seconds at the fastest
@@ -56,11 +57,11 @@ class Term(NamedTuple):
 
     Args:
         effect: its name.
-        acts_on: the state whose rate it changes, the input or the measured quantity that it alters; of a term on several
-            rates or inputs their names, separated by commas.
-        kind: RATE, INPUT, SENSOR or one of OPERATORS.
+        acts_on: the state whose rate it changes, the input, the measured quantity or the parameter that it alters; of a term on
+            several rates or inputs their names, separated by commas.
+        kind: RATE, INPUT, SENSOR, PARAMETER or one of OPERATORS.
         expression: in the names of the model and of the parameters; empty for operators and for terms on several places. RATE
-            adds it to the rate; INPUT and SENSOR put it in place of the quantity.
+            and PARAMETER add it to the rate or the parameter; INPUT and SENSOR put it in place of the quantity.
         parameters: its parameters.
         meaning: one physical sentence.
         same_as: names of effects that no data can tell from this one.

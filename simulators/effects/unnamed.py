@@ -13,7 +13,7 @@ from numpy.polynomial import chebyshev, polynomial
 
 from simulators.effects.expression import Scales
 from simulators.effects.structure import structure
-from simulators.effects.term import RATE, EffectParameter, Term
+from simulators.effects.term import PARAMETER, RATE, EffectParameter, Term
 from simulators.effects.units import per
 from simulators.groups import slots_of
 from simulators.model import Model
@@ -30,29 +30,15 @@ def unnamed(model: Model, scales: Scales, *, pairs: bool = False) -> list[Term]:
     """Return one function of each state and input, or pair of these, for every rate that something may be missing from."""
     terms = []
     units = {q.name: q.unit for q in model.states}
-    periodic = {q.name for q in model.states if q.periodic}
-    slots = {i for column in slots_of(model) for i in column}  # which group a row is of is no argument
-    inputs = [q.name for i, q in enumerate(model.inputs) if i not in slots]
-    arguments = [*(q.name for q in model.states), *inputs]
+    arguments = arguments_of(model)
     for name in structure(model).dynamic:
         for argument in arguments:
             if scales.size[argument] <= 0:
                 continue
-            prefix = f"unnamed_{name}_of_{argument}_w"
-            amplitude = AMPLITUDE * scales.rate[name]
-            turns = argument in periodic
-            size = (f"size_of_{argument}", scales.size[argument])
-            waves, shares = _harmonics(argument) if turns else _sines(argument, size[0])
-            parameters = tuple(
-                EffectParameter(f"{prefix}{j}", f"w{j}", per(units[name], "s"), -2 * sd, 2 * sd, 0.0, (0.0,), "normal")
-                for j, sd in enumerate((amplitude * share for share in shares), start=1)
+            term = _of_one(
+                model, scales, argument, f"unnamed_{name}", per(units[name], "s"), AMPLITUDE * scales.rate[name]
             )
-            text = " + ".join(f"{k.name}*{wave}" for k, wave in zip(parameters, waves, strict=True))
-            meaning = f"some function of {argument}"
-            constants = () if turns else (size,)
-            terms.append(
-                Term("unnamed", name, RATE, text, parameters, meaning, depends_on=(argument,), constants=constants)
-            )
+            terms.append(term._replace(acts_on=name))
     if pairs and len(arguments) <= MOST_ARGUMENTS:
         terms += functions_of_two(model, scales)
     return terms
@@ -65,15 +51,10 @@ def functions_of_two(model: Model, scales: Scales, bases: int = PAIR_BASES) -> l
 
 
 def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> list[Term]:
-    slots = {i for column in slots_of(model) for i in column}
-    states, inputs = [q.name for q in model.states], [q.name for i, q in enumerate(model.inputs) if i not in slots]
-    periodic = {q.name for q in model.states if q.periodic}
+    states, arguments = [q.name for q in model.states], arguments_of(model)
     terms: list[Term] = []
-    bases = {}
-    for a in (*states, *inputs):
-        waves, shares = _harmonics(a) if a in periodic else _sines(a, f"size_of_{a}")
-        bases[a] = list(zip(waves, shares, strict=True))[:most]
-    for a, b in combinations((*states, *inputs), 2):
+    bases = {a: waves_of(model, a)[:most] for a in arguments}
+    for a, b in combinations(arguments, 2):
         if a not in states:
             continue
         parameters, sums = [], []
@@ -88,7 +69,7 @@ def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> lis
                 )
                 row.append(f"{parameters[-1].name}*{other}")
             sums.append(f"{wave}*({' + '.join(row)})")
-        constants = tuple((f"size_of_{c}", scales.size[c]) for c in (a, b) if c not in periodic)
+        constants = sizes_of(model, scales, (a, b))
         meaning = f"some function of {a} and {b}"
         terms.append(
             Term(
@@ -103,6 +84,50 @@ def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> lis
             )
         )
     return terms
+
+
+def dependent(
+    model: Model, scales: Scales, parameter: str, argument: str, unit: str, size: float, bases: int
+) -> Term:  # fmt: skip
+    """Return a parameter as a function of a state or an input: what that adds to it, of a standard deviation of `size`."""
+    term = _of_one(model, scales, argument, f"unnamed_{parameter}", unit, size, bases)
+    return term._replace(
+        effect="dependent", acts_on=parameter, kind=PARAMETER, meaning=f"{parameter} depends on {argument}"
+    )
+
+
+def arguments_of(model: Model) -> list[str]:
+    """Return the states and inputs that a function may be of; which group a row is of is none."""
+    slots = {i for column in slots_of(model) for i in column}
+    return [*(q.name for q in model.states), *(q.name for i, q in enumerate(model.inputs) if i not in slots)]
+
+
+def waves_of(model: Model, argument: str) -> list[tuple[str, float]]:
+    """Return the waves of an argument with their standard deviations, as shares."""
+    turns = any(q.periodic and q.name == argument for q in model.states)
+    waves, shares = _harmonics(argument) if turns else _sines(argument, f"size_of_{argument}")
+    return list(zip(waves, shares, strict=True))
+
+
+def sizes_of(model: Model, scales: Scales, arguments: tuple[str, ...]) -> tuple[tuple[str, float], ...]:
+    """Return the constants that waves of these arguments need."""
+    periodic = {q.name for q in model.states if q.periodic}
+    return tuple((f"size_of_{a}", scales.size[a]) for a in arguments if a not in periodic)
+
+
+def _of_one(
+    model: Model, scales: Scales, argument: str, prefix: str, unit: str, amplitude: float, bases: int = BASES
+) -> Term:
+    """Return a function of one argument that adds to a rate."""
+    parameters, waves = [], []
+    for j, (wave, share) in enumerate(waves_of(model, argument)[:bases], start=1):
+        sd, name = amplitude * share, f"{prefix}_of_{argument}_w{j}"
+        parameters.append(EffectParameter(name, f"w{j}", unit, -2 * sd, 2 * sd, 0.0, (0.0,), "normal"))
+        waves.append(f"{name}*{wave}")
+    return Term(
+        "unnamed", "", RATE, " + ".join(waves), tuple(parameters), f"some function of {argument}", depends_on=(argument,),
+        constants=sizes_of(model, scales, (argument,)),
+    )  # fmt: skip
 
 
 def _sines(argument: str, size: str) -> tuple[list[str], list[float]]:

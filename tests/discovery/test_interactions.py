@@ -114,7 +114,13 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
     assessor, terminal = Assessor(plan, 10), Terminal(True, folder / "run.log")
     selection, gates, _ = gated_selection(search, assessor, select(search), terminal)
     left, gates = with_interactions(
-        NoiseProfile(search, assessor, selection.chosen), selection, gates, attach, Discovery(), terminal
+        NoiseProfile(search, assessor, selection.chosen),
+        NoiseProfile(search, assessor, selection.base),
+        selection,
+        gates,
+        attach,
+        Discovery(),
+        terminal,
     )
     assert len(gates) == len(left.chosen.terms)
     return search, assessor, selection, left

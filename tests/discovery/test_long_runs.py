@@ -9,8 +9,8 @@ from simpel_cli.discovery.search.gate.long_runs import gone_astray
 from simpel_cli.discovery.search.sets.forward import selected
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained import interactions
+from simpel_cli.discovery.search.unexplained.function_screening import Promise
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.unexplained.pair_screening import Promise
 from simpel_cli.discovery.search.uses import FREE_RUN, windows_for
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.fit import Fitter
@@ -115,5 +115,6 @@ def test_a_state_that_an_effect_brought_is_no_argument_of_a_function(
 
     monkeypatch.setattr(interactions, "promised", promised)
     monkeypatch.setattr(interactions, "_worth_a_fit", lambda *_: [])
-    assert interactions.interaction(NoiseProfile(search, assessor, chosen), setup, 2) is None
+    levels = NoiseProfile(search, assessor, chosen)
+    assert interactions.interaction(levels, levels, setup, 2) is None
     assert {(t.acts_on, t.depends_on) for t in asked} == {("x", ("x", "u"))}

@@ -1,9 +1,10 @@
 """The blind exam: `python -m tests.exam --sets 600 --seed 1 --out /somewhere`.
 
 Every set is written, given to `simpel discover` as a user would, and scored against a truth that the tool cannot reach.
-`--out` of an earlier exam goes on with it; `--only` leaves the other systems to other runs on the same `--out`, now or later;
-`--score-only` scores anew what was run there. The table is of all sets in that folder. `--second` is the second exam, whose
-measurements have the nuisances of real rigs.
+`--out` of an earlier exam goes on with it; `--known FILE` begins with the scores of one, which it left as `scores.parquet`;
+`--only` leaves the other systems to other runs on the same `--out`, now or later; `--score-only` scores anew what was run
+there. The table is of all sets in that folder. `--second` is the second exam, whose measurements have the nuisances of real
+rigs. Exams that are not complete are kept in `data/exam/`.
 """
 
 import argparse
@@ -49,6 +50,7 @@ def main() -> None:
         metavar="N",
         help="processes, each on a core",
     )
+    parser.add_argument("--known", type=Path, metavar="FILE", help="scores.parquet of the same exam, begun elsewhere")
     parser.add_argument("--score-only", type=Path, metavar="DIR", help="score the runs of an earlier exam anew")
     options = parser.parse_args()
     if (options.out is None) == (options.score_only is None):
@@ -73,6 +75,8 @@ def main() -> None:
         "tuned": {} if options.second else earlier.get("tuned") or tuned(),
     }  # fmt: skip
     put(out / PLAN, told)
+    if options.known:
+        begin_with(options.known, out, told)
     drawn_by = draw_second if options.second else draw
     sets = [d for d in (drawn_by(i, options.seed) for i in range(options.sets)) if d.system in options.only]
     waiting = [d for d in sets if not score_file(out, d.index).exists()]
@@ -83,6 +87,22 @@ def main() -> None:
 def plan(out: Path) -> dict[str, Any]:
     """Return what an earlier run has told of the exam in a folder."""
     return json.loads((out / PLAN).read_text()) if (out / PLAN).exists() else {}
+
+
+def begin_with(known: Path, out: Path, told: Mapping[str, Any]) -> None:
+    """Put the scores of sets that were examined elsewhere where their exam goes on.
+
+    Raises:
+        SystemExit: they are of another exam.
+    """
+    scores = pd.read_parquet(known)
+    drawn_by = draw_second if told["second"] else draw
+    for row in scores.to_dict("records"):
+        drawn = drawn_by(int(row["index"]), told["seed"])
+        if (drawn.system, drawn.noise, drawn.condition) != (row["system"], row["noise"], row["condition"]):
+            raise SystemExit(f"--known {known}: set {row['index']} is none of the exam with seed {told['seed']}")
+        if not score_file(out, drawn.index).exists():
+            keep(out, {name: value for name, value in row.items() if not pd.isna(value)})
 
 
 def again(path: Path, out: Path, told: Mapping[str, Any]) -> None:

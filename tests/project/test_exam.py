@@ -539,6 +539,42 @@ def test_runs_on_one_folder_share_the_systems(tmp_path: Path, monkeypatch: pytes
     assert json.loads((tmp_path / "exam.json").read_text())["tuned"] == {"cart 0.01": [0.1, "left"]}
 
 
+def test_an_exam_goes_on_from_scores_that_were_made_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table is the same as if all had been run in one place; scores of another exam are refused."""
+    ran: list[int] = []
+
+    def fake(waiting: list[Set], out: Path, tuned: Any, workers: int) -> None:
+        for d in waiting:
+            ran.append(d.index)
+            numbers = {
+                "strength": 0.5,
+                "evidence": float("nan") if d.index % 2 else 20.0,
+                "of_oracle": None,
+                "of_before": 1.5,
+            }
+            told = {"outcome": "right", "names": "a|b", "remainder": d.index % 3 == 0, "covered": 2, "intervals": 3}
+            campaign.keep(
+                out, campaign.lost(d, out, "") | numbers | told | {"seconds": 2.0, "candidates": 3, "wall": 4.0}
+            )
+
+    monkeypatch.setattr(main, "run", fake)
+    monkeypatch.setattr(main, "tuned", dict)
+    first, second, whole, other = (tmp_path / name for name in ("first", "second", "whole", "other"))
+
+    def exam(out: Path, sets: int, *more: str, seed: int = 4) -> None:
+        monkeypatch.setattr("sys.argv", ["exam", "--sets", str(sets), "--seed", str(seed), "--out", str(out), *more])
+        main.main()
+
+    exam(first, 7)
+    exam(second, 12, "--known", str(first / "scores.parquet"))
+    assert ran == [*dict.fromkeys(ran)]
+    assert len(ran) == 12
+    exam(whole, 12)
+    assert (second / "table.md").read_text() == (whole / "table.md").read_text()
+    with pytest.raises(SystemExit, match="none of the exam with seed 5"):
+        exam(other, 7, "--known", str(first / "scores.parquet"), seed=5)
+
+
 def test_plays_and_slow_sensors_agree_with_their_definitions() -> None:
     dt, tau, half = 0.04, 0.05, 0.8
     p = {"M": 1.4, "K": 60.0, "K_m": 4.0, "b": 2.0}

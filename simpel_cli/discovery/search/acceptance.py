@@ -17,7 +17,7 @@ from simpel_cli.discovery.search.sets.rivals import rivalled
 from simpel_cli.discovery.search.sets.selection import Selection, cut, refused
 from simpel_cli.discovery.search.settings import Discovery
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
-from simpel_cli.discovery.search.unexplained.interactions import interaction
+from simpel_cli.discovery.search.unexplained.interactions import in_words, interaction
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.search.uses import ONE_STEP
 from simpel_cli.filtering.errors_ahead import Assessor
@@ -232,20 +232,21 @@ def _by_row(search: Search, assessor: Assessor, trial: Trial) -> np.ndarray:
 
 def with_interactions(
     levels: NoiseProfile,
+    alone: NoiseProfile,
     selection: Selection,
     judged: list[Gate],
     attach: Callable[..., Setup],
     options: Discovery,
     terminal: Terminal,
 ) -> tuple[Selection, list[Gate]]:
-    """Look once more whether what is left is a function of two arguments."""
+    """Look once more whether what is left is a function of two arguments, or a parameter that depends on one."""
     known = selection.remainder[1] if selection.remainder else 0.0
     report = lambda text: terminal.line(text, "search")  # noqa: E731
-    found = interaction(levels, attach, options.lanes, report, known)
+    found = interaction(levels, alone, attach, options.lanes, report, known)
     if found is None:
         return selection, judged
     _report_gate(
-        f"function of {' and '.join(found.term.depends_on)} +{found.gain:.0f}",
+        f"{in_words(found.term)} +{found.gain:.0f}",
         found.gate,
         terminal,
         out=not found.gate.passed,

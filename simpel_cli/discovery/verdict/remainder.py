@@ -8,8 +8,12 @@ from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
 from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
+from simpel_cli.discovery.search.unexplained.function_screening import changed_by
 from simpel_cli.filtering.errors_ahead import Assessment
+from simpel_cli.filtering.likelihood.augmented import augment
 from simpel_cli.filtering.likelihood.whiteness import memory
+from simulators.effects import Term
+from simulators.effects.term import PARAMETER
 from simulators.effects.units import per
 
 ALIKE = 0.3  # of an input's variance, at the period of a disturbance
@@ -50,6 +54,13 @@ def still_wrong(search: Search, chosen: Trial, worst: str, times: float, horizon
     }
 
 
+def left_in_words(remainder: dict[str, Any]) -> str:
+    """Return what remains beside the effects, as a sentence without its full stop."""
+    if "parameter" in remainder:
+        return remainder["description"][0].upper() + remainder["description"][1:]
+    return f"The remaining model error depends on {dependence(remainder)}"
+
+
 def dependence(remainder: dict[str, Any]) -> str:
     """Return what the remaining model error depends on, in words."""
     period = remainder.get("period")
@@ -63,6 +74,7 @@ def _of_parameter(search: Search, chosen: Trial, drift: Drift) -> dict[str, Any]
         "rms": noise_of(search, chosen)[1] / np.sqrt(search.plan.augmented.model.dt),
         "unit": _unit(search, drift.acts_on),
         "log_evidence_gain": drift.gain,
+        "parameter": drift.parameter,
         "description": f"a parameter is no constant: {drift.words}",
     }
 
@@ -71,6 +83,8 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
     if selection.remainder is None:
         return None
     term, gain = selection.remainder
+    if term.kind == PARAMETER:
+        return _dependent(search, selection.chosen, term, gain)
     scale = search.plan.scales.rate[term.acts_on]
     level = noise_of(search, selection.chosen)[1]
     unit = term.parameters[0].unit
@@ -82,6 +96,25 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
         "log_evidence_gain": gain,
         "description": f"an unknown function of {', '.join(term.depends_on)} acts on d({term.acts_on})/dt "
         f"(typical rate in the data: {scale:.3g} {unit})",
+    }
+
+
+def _dependent(search: Search, chosen: Trial, term: Term, gain: float) -> dict[str, Any]:
+    """Describe a parameter that depends on a state or an input."""
+    effects = [search.terms[t] for t in chosen.terms]
+    augmented = augment(search.plan.augmented.model, [*effects, term], search.plan.augmented.measured)
+    acts_on = max(changed_by(augmented, term), key=lambda name: search.plan.scales.rate[name])
+    label = next(
+        (f"{k.label} of {t.effect}" for t in effects for k in t.parameters if k.name == term.acts_on), term.acts_on
+    )
+    return {
+        "acts_on": acts_on,
+        "depends_on": list(term.depends_on),
+        "rms": noise_of(search, chosen)[1] / np.sqrt(search.plan.augmented.model.dt),
+        "unit": _unit(search, acts_on),
+        "log_evidence_gain": gain,
+        "parameter": label,
+        "description": f"a parameter is no constant: {label} depends on {' and '.join(term.depends_on)}",
     }
 
 

@@ -13,7 +13,7 @@ from simpel_cli.discovery.search.share import explained
 from simpel_cli.discovery.search.trials import Search, Trial, asked
 from simpel_cli.discovery.verdict.aliases import are_aliases, of_structure
 from simpel_cli.discovery.verdict.groups import Z90, differing, groups_of
-from simpel_cli.discovery.verdict.remainder import dependence, noise_of, still_wrong
+from simpel_cli.discovery.verdict.remainder import left_in_words, noise_of, still_wrong
 from simpel_cli.filtering.errors_ahead import Assessment, Assessor, reduction_interval, results, rmse
 from simpel_cli.filtering.independent_parts import independent_parts
 from simpel_cli.filtering.measurements.windows import Windows
@@ -271,7 +271,7 @@ def sentence(found: dict[str, Any], before: Assessment, after: Assessment, measu
         )
     parts, share = [_phrase(e) for e in found["effects"]], float(np.nan_to_num(max(found["share_explained"], 0.0)))
     listed = " and ".join(parts)
-    rest = f" The remaining model error depends on {dependence(found['remainder'])}." if found["remainder"] else ""
+    rest = f" {left_in_words(found['remainder'])}." if found["remainder"] else ""
     match found["verdict"]:
         case "effect":
             told = np.isfinite(found["share_explained"]) and share < ALL

@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from simulators.effects import Structure, Term, stores_of, structure, with_stores
-from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, SENSOR, SENSOR_DELAY, SENSOR_LAG
+from simulators.effects.term import DELAY, LAG, ON_INPUT, OPERATORS, PARAMETER, SENSOR, SENSOR_DELAY, SENSOR_LAG
 from simulators.expression import parse
 from simulators.model import Model, Quantity
 
@@ -100,7 +100,11 @@ def augment(
     names |= {q.name: u[j] for j, q in enumerate(model.inputs)}
     for grouping in (g for term in terms for g in term.groupings):
         names[grouping.parameter] = grouping.value(names)
-    own = p[: len(model.params)]
+    own, columns = p[: len(model.params)], [q.name for q in params]
+    for term in (t for t in terms if t.kind == PARAMETER):
+        names[term.acts_on] += parse(term.expression, names, model.symbol)
+        if term.acts_on in columns[: len(model.params)]:
+            own[columns.index(term.acts_on)] = names[term.acts_on]
     given = [u[j] for j in range(len(model.inputs))]
     for j, q in enumerate(model.inputs):
         for term in terms:
@@ -133,7 +137,6 @@ def augment(
         ["x", "u", "p"],
         ["dx", "y"],
     )
-    columns = [q.name for q in params]
     operators: dict[str, tuple[tuple[int, int], ...]] = {}
     for kind in OPERATORS:
         signals = [q.name for q in model.inputs] if kind in ON_INPUT else [*measured]

@@ -57,19 +57,20 @@ def shifts(
 
 
 def waves(
-    augmented: Augmented, term: Term, p: np.ndarray, points: Sequence[tuple[np.ndarray, np.ndarray]]
+    augmented: Augmented, term: Term, p: np.ndarray, points: Sequence[tuple[np.ndarray, np.ndarray]], acts_on: str = ""
 ) -> list[np.ndarray]:
-    """Return what each weight of a function adds to the rate, per standard deviation of its prior, (..., n) per entry.
+    """Return what each weight of a function adds to a rate, per standard deviation of its prior, (..., n) per entry.
 
     Args:
         augmented: a model that has the term.
         term: a function without a name: linear in its parameters, which have normal priors.
         p: (dp,) values of all parameters.
         points: states (..., nx) and inputs (..., nu).
+        acts_on: state whose rate it is; empty: that of the term.
     """
     function = augmented.function
     x, u, q = (augmented.model.symbol.sym(n, function.size1_in(i)) for i, n in enumerate("xup"))
-    row = [s.name for s in augmented.model.states].index(term.acts_on)
+    row = [s.name for s in augmented.model.states].index(acts_on or term.acts_on)
     slope = casadi.jacobian(function(x, u, q)[0][row], q)[:, augmented.rows(term)]
     program = casadi.Function("waves", [x, u, q], [casadi.densify(slope).T])
     sd = np.array([(parameter.high - parameter.low) / 4 for parameter in term.parameters])

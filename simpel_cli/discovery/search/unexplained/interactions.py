@@ -1,8 +1,9 @@
-"""A last look at what a chosen model leaves, whether it is a function of two arguments.
+"""A last look at what a chosen model leaves, whether it is a function of two arguments, or a parameter that depends on one.
 
-Functions of two arguments are many and wide, so the program of a search does not carry them. Where nothing else was left
-they are screened without a program (`promising`); the best are compiled into a small one with the chosen effects, fitted
-from the chosen optimum, and judged like everything else: by evidence and on held-out episodes.
+These functions are many and wide, so the program of a search does not carry them. Where nothing else was left they are
+screened without a program (`promised`); the best are compiled into a small one with the chosen effects, fitted from the
+chosen optimum, and judged like everything else: by evidence and on held-out episodes. A parameter that depends on something
+may also be what the chosen effects stand for, so it is screened without these, too.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,23 +12,27 @@ from typing import NamedTuple
 import numpy as np
 
 from simpel_cli.discovery.search.gate.held_out import Gate, gates
+from simpel_cli.discovery.search.sets.selection import worth
 from simpel_cli.discovery.search.smaller import fitted_again, small_search
-from simpel_cli.discovery.search.trials import ACCEPT
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
+from simpel_cli.discovery.search.unexplained.dependent_parameters import dependent_parameters
+from simpel_cli.discovery.search.unexplained.function_screening import Promise, promised
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.discovery.search.unexplained.pair_screening import Promise, promised
 from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
+from simulators.effects.term import PARAMETER
 from simulators.groups import slots_of
 
 BASES = (2, 4)  # waves per argument: a function that needs few is seen sooner with few
 MOST_FITTED = 2
 SHARE = 0.5  # of the largest promise, for a second one to be fitted
 MOST_ARGUMENTS = 10
+HALF = 0.5  # of what effects explain: to first order a function promises half of what it then explains, or more
 
 
 class Interaction(NamedTuple):
-    """A function of two arguments that earned its place.
+    """A function that earned its place.
 
     Args:
         term: what it is.
@@ -44,19 +49,21 @@ class Interaction(NamedTuple):
 
 def interaction(
     levels: NoiseProfile,
+    alone: NoiseProfile,
     attach: Callable[..., Setup],
     side_by_side: int,
     report: Callable[[str], None] = lambda _: None,
     known: float = 0.0,
 ) -> Interaction | None:
-    """Return the function of two arguments that the data ask for beside the chosen terms; None where there is none.
+    """Return the function that the data ask for beside the chosen terms, or in their place; None where there is none.
 
     Args:
         levels: of the model that a search ended with.
+        alone: of the simulator.
         attach: (kept, extra) -> the setup of a program with these terms alone.
         side_by_side: fits that run side by side.
         report: takes a line that says what goes on.
-        known: evidence that a function of one argument earns there, which one of two has to beat, nats.
+        known: evidence that a function of one argument earns there, which another one has to beat, nats.
     """
     search, assessor, chosen = levels.search, levels.assessor, levels.chosen
     model = search.plan.augmented.model
@@ -66,11 +73,14 @@ def interaction(
         return None
     here: set[Key] = {key_of(t) for t in search.terms}
     every = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
+    every += [t for n in BASES for t in dependent_parameters(search, chosen, search.plan.scales, n)]
     terms = [t for t in every if not brought & {t.acts_on, *t.depends_on}]
     going = _worth_a_fit(promised(levels, terms), terms, known + ACCEPT)
+    if chosen.terms:
+        going += [t for t in _instead(alone, chosen, brought) if key_of(t) not in [*map(key_of, going)]]
     if not going:
         return None
-    report("is it a function of " + ", or of ".join(" and ".join(t.depends_on) for t in going))
+    report("is it that " + ", or that ".join(map(in_words, going)))
     kept = {key_of(search.terms[t]) for t in chosen.terms}
     plan = attach(kept=frozenset(kept), extra=going)._replace(windows=search.plan.windows, spare=search.plan.spare)
     unknowns = sum(len(search.all_rows(t)) for t in chosen.terms) + max(len(t.parameters) for t in going)
@@ -79,23 +89,52 @@ def interaction(
     own, names = before.terms, [key_of(t) for t in small.terms]
     trials = small.add(before, [names.index(key_of(t)) for t in going]).trials
     search.tried += len(going)
-    if not trials:
+    settled = [found for trial in trials if (found := _needed(small, trial)) is not None]
+    if not settled:
         return None
-    whole, new = trials[0], trials[0].terms[-1]
+    after = max(settled, key=worth)
+    new = max(after.terms)
     # so that the smaller model has had every chance that the larger one had
-    before = small.best(
-        own, small.fitter([Hypothesis(small.off(whole.optimum.z, (new,)), small.free(own), small.ones)])
-    )
-    if not whole.optimum.log_evidence - before.optimum.log_evidence > known + ACCEPT:
-        return None
-    after = small.prune(whole)[0]  # an effect that was named for want of this function is needed no longer
-    if new not in after.terms:
+    start = Hypothesis(small.off(trials[0].optimum.z, trials[0].terms[-1:]), small.free(own), small.ones)
+    before = small.best(own, small.fitter([start]))
+    if not after.optimum.log_evidence - before.optimum.log_evidence > known + ACCEPT:
         return None
     rest = tuple(t for t in own if t in after.terms)
     before = small.best(rest, small.fitter(small.less(after, rest)))
     gain = after.optimum.log_evidence - before.optimum.log_evidence
     (judged,) = gates(small, assessor.of(plan), after, [before])
     return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
+
+
+def in_words(term: Term) -> str:
+    """Return what a function says."""
+    return term.meaning if term.kind == PARAMETER else f"a function of {' and '.join(term.depends_on)} acts"
+
+
+def _needed(small: Search, whole: Trial) -> Trial | None:
+    """Return a function with what earns its place beside it of the chosen effects; None where it earns none itself.
+
+    An effect that was named for want of the function goes, but not one of whose size the function is a part.
+    """
+    new = whole.terms[-1]
+    after = small.prune(whole)[0]
+    if not {t for t in whole.terms[:-1] if _is_of(small.terms[new], small.terms[t])} <= {*after.terms}:
+        after = whole
+    return after if new in after.terms else None
+
+
+def _is_of(function: Term, effect: Term) -> bool:
+    """Whether a function is what adds to a parameter of an effect."""
+    return function.acts_on in [k.name for k in effect.parameters]
+
+
+def _instead(alone: NoiseProfile, chosen: Trial, brought: set[str]) -> list[Term]:
+    """Return the parameters of the simulator that promise, as functions, a good part of what the chosen effects explain."""
+    search = alone.search
+    terms = [t for n in BASES for t in dependent_parameters(search, alone.chosen, search.plan.scales, n)]
+    terms = [t for t in terms if not brought & {*t.depends_on}]
+    effects = chosen.optimum.log_evidence - alone.chosen.optimum.log_evidence
+    return _worth_a_fit(promised(alone, terms), terms, max(HALF * effects, ACCEPT))
 
 
 def _worth_a_fit(promises: Sequence[Promise], terms: Sequence[Term], least: float) -> list[Term]:
