@@ -352,8 +352,15 @@ def _with(
     levels, alone_levels = (NoiseProfile(search, assessor, t) for t in (selection.chosen, selection.base))
     attach_said = partial(attach, saying(model, between_rows))
     # what simulations have chosen need not be worth anything one row ahead: no function may take its place there
-    if by_simulations is None and not ground.budget.over("functions of two arguments"):
+    if by_simulations is None and not ground.budget.over(
+        "functions of two arguments, and parameters that depend on one"
+    ):
         selection, gates = with_interactions(levels, alone_levels, selection, gates, attach_said, options, terminal)
+        levels = (
+            levels
+            if levels.chosen.terms == selection.chosen.terms
+            else NoiseProfile(search, assessor, selection.chosen)
+        )
     alone = drifting(alone_levels, (BETWEEN,)) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
@@ -361,8 +368,9 @@ def _with(
         again = again and again._replace(simulated=begun)
         if again is not None and not model.groups:
             return again
+    known = selection.remainder[1] if selection.remainder else 0.0
     # nor may a drift
-    if by_simulations is None and stands_for(alone, selection.base, selection.chosen):
+    if by_simulations is None and stands_for(alone, selection.base, selection.chosen, known):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
         selection, gates = cut(search, selection, [])._replace(remainder=None), []
         levels = NoiseProfile(search, assessor, selection.chosen)

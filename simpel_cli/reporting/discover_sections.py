@@ -278,6 +278,8 @@ def remainder_section(found: Mapping[str, Any]) -> Section:
     where = f"The model error in d({rest['acts_on']})/dt depends on {dependence(rest)}"
     if "parameter" in rest or not rest["depends_on"]:
         where = rest["description"][0].upper() + rest["description"][1:]
+    if "parameter" in rest:
+        size = f" (the model error in d({rest['acts_on']})/dt has a root mean square of {rms:.3g} {rest['unit']})"
     return {
         "title": "Unexplained model error",
         "note": f"{where}{size}. No known effect "

@@ -87,13 +87,22 @@ def _pairs(name: str, unit: str, model: Model, scales: Scales, most: int) -> lis
 
 
 def dependent(
-    model: Model, scales: Scales, parameter: str, argument: str, unit: str, size: float, bases: int
-) -> Term:  # fmt: skip
-    """Return a parameter as a function of a state or an input: what that adds to it, of a standard deviation of `size`."""
-    term = _of_one(model, scales, argument, f"unnamed_{parameter}", unit, size, bases)
-    return term._replace(
-        effect="dependent", acts_on=parameter, kind=PARAMETER, meaning=f"{parameter} depends on {argument}"
-    )
+    model: Model, scales: Scales, parameter: tuple[str, str], argument: str, unit: str, size: float, bases: int
+) -> Term:
+    """Return a parameter as a function of a state or an input: what that adds to it, of a standard deviation of `size`.
+
+    Args:
+        model: that has the parameter, or to which an effect brings it.
+        scales: magnitudes.
+        parameter: its name, and what it is called.
+        argument: of the function.
+        unit: of the parameter.
+        size: of what is added to it.
+        bases: waves of the argument.
+    """
+    name, label = parameter
+    term = _of_one(model, scales, argument, f"unnamed_{name}", unit, size, bases)
+    return term._replace(effect="dependent", acts_on=name, kind=PARAMETER, meaning=f"{label} depends on {argument}")
 
 
 def arguments_of(model: Model) -> list[str]:

@@ -3,26 +3,33 @@
 from functools import partial
 from pathlib import Path
 
+import casadi
 import numpy as np
 import pytest
-from linear_plant import DT, recording
+from linear_plant import DT, LOAD, recording
 
 from simpel_cli.data.recording import Check, Episode, Recording
 from simpel_cli.discovery.search.acceptance import gated_selection, with_interactions
+from simpel_cli.discovery.search.gate.held_out import gates as gates_of
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import Search
-from simpel_cli.discovery.search.unexplained.dependent_parameters import dependent_parameters, slopes_of
+from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained import interactions
+from simpel_cli.discovery.search.unexplained.dependent_parameters import dependent_parameters, label_of, slopes_of
 from simpel_cli.discovery.search.unexplained.function_screening import changed_by
+from simpel_cli.discovery.search.unexplained.interactions import _settled
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import left_in_words, remainder_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.augmented import augment
+from simpel_cli.filtering.likelihood.coordinates import CUT, Coordinates
 from simpel_cli.filtering.likelihood.fit import Fitter
+from simpel_cli.filtering.likelihood.sensitivity import shifts, waves
 from simpel_cli.filtering.setup import setup
 from simpel_cli.runs.console import Terminal
-from simulators.effects import Expression, Scales, dependent
+from simulators.effects import Expression, Scales, Term, dependent
 from simulators.model import Declared, Model
+from simulators.quantity import Quantity
 
 FRICTION = Expression("friction", acts_on="v", term="-c*v*w", parameters={
     "c": {"range": [0, 2], "unit": "1/s"}, "w": {"range": [0.5, 2], "unit": "1", "neutral": 1.0},
@@ -52,8 +59,8 @@ def test_what_depends_on_a_quantity_is_added_to_the_parameter_of_the_model_and_o
     """Against the rates at the parameters that it comes to, row by row."""
     model, random = swing(), np.random.default_rng(0)
     (friction,) = FRICTION.attach(model, scales_of(model), ["angle", "v"])
-    loss = dependent(model, scales_of(model), "d", "v", "1/s", 0.5, 3)
-    size = dependent(model, scales_of(model), friction.parameters[0].name, "angle", "1/s", 0.5, 4)
+    loss = dependent(model, scales_of(model), ("d", "d"), "v", "1/s", 0.5, 3)
+    size = dependent(model, scales_of(model), (friction.parameters[0].name, "c"), "angle", "1/s", 0.5, 4)
     augmented = augment(model, [friction, loss, size], ["angle", "v"])
     names = [q.name for q in augmented.params]
     p = random.uniform(0.1, 0.9, len(names))
@@ -85,12 +92,27 @@ def test_the_rates_that_a_parameter_changes_and_what_their_slopes_depend_on() ->
     assert slopes.arguments["c"] == {"v": frozenset()}
     assert slopes.arguments[size] == {"v": {"v"}}
     assert {"b", "g", "d", "c", size, shape} <= slopes.linear
-    quadratic = Expression("hinge", acts_on="v", term="-k*max(v - e, 0)", parameters={
+    hinged = Expression("hinge", acts_on="v", term="-k*max(v - e, 0)", parameters={
         "k": {"range": [0, 2], "unit": "1/s"}, "e": {"range": [0, 2], "unit": "rad/s", "neutral": 1.0},
     })  # fmt: skip
-    (hinge,) = quadratic.attach(model, scales_of(model), ["angle", "v"])
+    (hinge,) = hinged.attach(model, scales_of(model), ["angle", "v"])
     linear = slopes_of(augment(model, [hinge], ["angle", "v"])).linear
     assert [k.label for k in hinge.parameters if k.name in linear] == ["k"]
+
+
+@pytest.mark.parametrize("symbol", [casadi.SX, casadi.MX])
+def test_a_mass_that_cancels_out_of_a_weight_is_no_function_of_the_angle(symbol: type) -> None:
+    """And its slope is one of the input alone: as a function of the input it is a force of one argument."""
+    names = {"phi": (-3.2, 3.2), "omega": (-9, 9)}
+    model = Model(
+        name="pendulum", dt=DT, substeps=1, outputs=(), gap={}, output=lambda x, u, p: symbol(0, 1), symbol=symbol,
+        states=tuple(Quantity(n, u, *r) for (n, r), u in zip(names.items(), ("rad", "rad/s"), strict=True)),
+        inputs=(Quantity("u", "V", -3, 3),), params=(Quantity("m", "kg", 0.6, 1.4), Quantity("g", "m/s^2", 9, 10)),
+        rhs=lambda x, u, p: casadi.vertcat(x[1], (p[0] * p[1] * casadi.sin(x[0]) + u[0]) / p[0]),
+    )  # fmt: skip
+    slopes = slopes_of(augment(model, [], ["phi", "omega"]))
+    assert slopes.arguments == {"m": {"omega": {"u"}}, "g": {"omega": {"phi"}}}
+    assert slopes.linear == {"g"}
 
 
 def two_nodes() -> Model:
@@ -129,12 +151,12 @@ def test_functions_of_one_argument_are_not_asked_again() -> None:
     plan = setup(swing(), recording_of_swing(), (), [FRICTION], 2)
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=12))
     base = search.base()
-    asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, base, plan.scales, 2)}
+    asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, base, [2])}
     # b u of u, g sin(angle) of the angle, and whatever c depends on, are forces of one argument
     assert asked == {("b", "angle"), ("b", "v"), ("g", "v"), ("g", "u"), ("d", "angle"), ("d", "v"), ("d", "u")}
     chosen = search.best((0,), search.fitter(search.hypotheses((0,), 0, base.optimum.z)))
     size, shape = (k.name for k in search.terms[0].parameters)
-    more = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, chosen, plan.scales, 2)} - asked
+    more = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, chosen, [2])} - asked
     assert more == {(size, "angle"), (size, "u"), (shape, "angle"), (shape, "u")}
 
 
@@ -144,7 +166,9 @@ def recording_of_swing() -> Recording:
 
 
 @pytest.mark.parametrize(("share", "seed"), [(0.25, 0), (0.25, 1), (0.0, 0)])
-def test_a_loss_that_depends_on_another_node_is_said_to_be_that(tmp_path: Path, share: float, seed: int) -> None:
+def test_a_loss_that_depends_on_another_node_is_said_to_be_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, seed: int
+) -> None:
     """An overflow does much of it, as long as nobody asks: it gives way. Where nothing is missing, nothing is said."""
     attach = partial(setup, two_nodes(), warmed(share, seed), (), [OVERFLOW], 2)
     plan = attach()
@@ -163,6 +187,11 @@ def test_a_loss_that_depends_on_another_node_is_said_to_be_that(tmp_path: Path, 
     assert (found["parameter"], found["depends_on"], found["acts_on"]) == ("a", ["first"], "second")
     assert found["log_evidence_gain"] > 20
     assert left_in_words(found) == "A parameter is no constant: a depends on first"
+    # where held-out errors grow with it in place of the overflow, that stays
+    refused = lambda *given: [g._replace(harm=i > 0) for i, g in enumerate(gates_of(*given))]  # noqa: E731
+    monkeypatch.setattr(interactions, "gates", refused)
+    beside = interactions.interaction(chosen, alone, attach, 4)
+    assert beside is None or beside.kept == (0,)
 
 
 def test_a_parameter_that_acts_on_two_rates_changes_both() -> None:
@@ -172,6 +201,86 @@ def test_a_parameter_that_acts_on_two_rates_changes_both() -> None:
         parameters={"k": {"unit": "1/s", "range": [0.5, 1.5]}, "m": {"unit": "1/s", "range": [0.5, 1.5]}},
         dynamics={"a": "-k*(a - b)", "b": "k*(a - b) - m*b"},
     ).model()  # fmt: skip
-    term, other = (dependent(model, scales_of(model), name, "b", "1/s", 1.0, 2) for name in "km")
-    assert changed_by(augment(model, [term], ["a", "b"]), term) == ["a", "b"]
-    assert changed_by(augment(model, [other], ["a", "b"]), other) == ["b"]
+    term, other = (dependent(model, scales_of(model), (name, name), "b", "1/s", 1.0, 2) for name in "km")
+    assert [*changed_by(augment(model, [term], ["a", "b"]), term)] == ["a", "b"]
+    assert [*changed_by(augment(model, [other], ["a", "b"]), other)] == ["b"]
+
+
+def exchange() -> Model:
+    """Two nodes that exchange heat: `k` acts on both rates."""
+    return Declared(
+        "exchange", dt=DT,
+        states={"first": {"unit": "degC", "range": [-3, 5]}, "second": {"unit": "degC", "range": [-3, 5]}},
+        inputs={"u": {"unit": "1", "range": [-3, 3]}},
+        parameters={"k": {"unit": "1/s", "range": [0.2, 1.2]}, "a": {"unit": "1/s", "range": [0.2, 1.2]}},
+        dynamics={"first": "u - k*(first - second)", "second": "k*(first - second) - a*second"},
+    ).model()  # fmt: skip
+
+
+def test_what_a_parameter_of_two_rates_does_to_the_innovations() -> None:
+    """Against differences of a filter whose program carries the function, on measurements that the model predicts."""
+    data = warmed(0.0, 0)
+    first = setup(exchange(), data, (), [], 2)
+    term = dependent(exchange(), first.scales, ("k", "k"), "second", "1/s", 1.0, 2)
+    plan = setup(exchange(), data, (), [], 2, extra=[term])
+    assessor, z, names = Assessor(plan, 3), plan.start, [q.name for q in plan.augmented.params]
+    y = np.asarray(assessor(z, plan.windows._replace(ok=0 * plan.windows.ok)).track.predicted)
+    windows = plan.windows._replace(y=y)
+    track = assessor(z, windows).track
+    inputs = windows.u[:, plan.lead : plan.lead + y.shape[1]]
+    p = np.array([plan.coordinates.value(i, z[i]) for i in range(len(names))])
+    following = np.roll(track.predicted, -1, axis=1)
+    rows = [["first", "second"].index(state) for state in changed_by(plan.augmented, term)]
+    forces = waves(plan.augmented, [term], p, [(np.asarray(track.mean), inputs), (following, inputs)], rows)
+    found = shifts(track, windows.ok > 0, forces, DT)
+    one_alone = shifts(track, windows.ok > 0, {0: forces[0]}, DT)
+    for n, row in enumerate(plan.augmented.rows(term)):
+        step = np.zeros_like(z)
+        step[row] = 1e-4 / (2 * CUT)  # of a standard deviation
+        ahead, back = (np.asarray(assessor(z + s, windows).track.innovation) for s in (step, -step))
+        change = (ahead - back) / 2e-4 * (windows.ok > 0)
+        assert np.linalg.norm(found[..., n] - change) < 0.06 * np.linalg.norm(change)
+        assert np.linalg.norm(one_alone[..., n] - change) > 0.5 * np.linalg.norm(change)
+
+
+def test_a_parameter_of_two_rates_is_asked_as_a_function_of_any_one_argument() -> None:
+    """No force on one rate can stand for it; the loss `a` as a function of `second` is one."""
+    plan = setup(exchange(), warmed(0.0, 0), (), [], 2)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8))
+    asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, search.base(), [2])}
+    assert asked == {("k", "first"), ("k", "second"), ("k", "u"), ("a", "first"), ("a", "u")}
+
+
+class _Pruning(Search):
+    """A search of which it is known what stays: places of terms."""
+
+    def __init__(self, terms: list[Term], *stays: int) -> None:
+        self.terms, self.stays = terms, stays
+
+    def prune(self, whole: Trial) -> tuple[Trial, tuple[float, ...], list[Trial]]:
+        return whole._replace(terms=self.stays), (), []
+
+
+def test_effects_beside_a_function_go_where_they_earn_nothing_but_not_the_one_that_it_is_a_part_of() -> None:
+    model = swing()
+    (friction,) = FRICTION.attach(model, scales_of(model), ["angle", "v"])
+    (load,) = LOAD.attach(model, scales_of(model), ["angle", "v"])
+    name = friction.parameters[0].name
+    function = dependent(model, scales_of(model), (name, "c of friction on v"), "angle", "1/s", 0.5, 2)
+    of_model = dependent(model, scales_of(model), ("d", "d"), "angle", "1/s", 0.5, 2)
+    whole = Trial((0, 1, 2), None)
+    assert [t.terms for t in _settled(_Pruning([friction, load, function], 0, 2), whole)] == [(0, 2), (0, 1, 2)]
+    assert [t.terms for t in _settled(_Pruning([friction, load, function], 1, 2), whole)] == [(0, 1, 2)]
+    assert [t.terms for t in _settled(_Pruning([friction, load, of_model], 2), whole)] == [(2,), (0, 1, 2)]
+    assert [t.terms for t in _settled(_Pruning([friction, load, of_model], 0, 1), whole)] == [(0, 1, 2)]
+    assert function.meaning == "c of friction on v depends on angle"
+    assert label_of(name, [load, friction]) == "c of friction on v"
+    assert label_of("d", [load, friction]) == "d"
+
+
+def test_of_a_logarithm_a_function_may_be_as_large_as_the_value() -> None:
+    coordinates = Coordinates(
+        np.array([np.log(0.01), -1.0]), np.array([np.log(10.0), 3.0]), np.array([True, False]), np.array([False, False]),
+        (2, 0, 0), (), 1,
+    )  # fmt: skip
+    np.testing.assert_allclose([coordinates.span(0, 0.5), coordinates.span(1, 0.5)], [np.sqrt(0.1), 4.0])

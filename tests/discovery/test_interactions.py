@@ -52,8 +52,8 @@ def test_innovations_shift_as_those_of_a_filter_that_knows_the_force(plan: Setup
     inputs = windows.u[:, plan.lead : plan.lead + ok.shape[1]]
     p = np.array([plan.coordinates.value(i, z[i]) for i in range(len(plan.augmented.params))])
     following = np.roll(track.predicted, -1, axis=1)
-    force = waves(plan.augmented, term, p, [(np.asarray(track.mean), inputs), (following, inputs)])
-    found = shifts(track, ok, *force, 1, plan.augmented.model.dt)
+    force = waves(plan.augmented, [term], p, [(np.asarray(track.mean), inputs), (following, inputs)], [1])
+    found = shifts(track, ok, force, plan.augmented.model.dt)
     for n, row in enumerate(plan.augmented.rows(term)[: max(BASES)]):
         step = np.zeros_like(z)
         step[row] = 1e-4 / (2 * CUT)  # of a standard deviation

@@ -17,6 +17,7 @@ from simpel_cli.filtering.likelihood.fit import Fitter
 from simpel_cli.filtering.setup import setup, with_memory
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, Term
+from simulators.effects.term import RATE
 from simulators.model import Declared
 
 DT, TRAIN, ROWS, NOISE, MEMORY = 0.1, 4000, 4500, 0.01, 2.0
@@ -117,4 +118,9 @@ def test_a_state_that_an_effect_brought_is_no_argument_of_a_function(
     monkeypatch.setattr(interactions, "_worth_a_fit", lambda *_: [])
     levels = NoiseProfile(search, assessor, chosen)
     assert interactions.interaction(levels, levels, setup, 2) is None
-    assert {(t.acts_on, t.depends_on) for t in asked} == {("x", ("x", "u"))}
+    of_two = {(t.acts_on, t.depends_on) for t in asked if t.kind == RATE}
+    assert of_two == {("x", ("x", "u"))}
+    brought = {store.name for t in search.terms for store in t.stores}
+    assert brought
+    assert len(asked) > len(of_two)
+    assert not brought & {name for t in asked for name in (t.acts_on, *t.depends_on)}

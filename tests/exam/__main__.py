@@ -55,6 +55,8 @@ def main() -> None:
     options = parser.parse_args()
     if (options.out is None) == (options.score_only is None):
         parser.error("give either --out DIR or --score-only DIR")
+    if options.known and options.score_only:
+        parser.error("--known goes with --out DIR")
     out = (options.out or options.score_only).resolve()
     earlier = plan(out)
     if options.score_only:
@@ -74,9 +76,9 @@ def main() -> None:
         "seed": options.seed, "sets": options.sets, "second": options.second,
         "tuned": {} if options.second else earlier.get("tuned") or tuned(),
     }  # fmt: skip
-    put(out / PLAN, told)
     if options.known:
         begin_with(options.known, out, told)
+    put(out / PLAN, told)
     drawn_by = draw_second if options.second else draw
     sets = [d for d in (drawn_by(i, options.seed) for i in range(options.sets)) if d.system in options.only]
     waiting = [d for d in sets if not score_file(out, d.index).exists()]
@@ -95,13 +97,16 @@ def begin_with(known: Path, out: Path, told: Mapping[str, Any]) -> None:
     Raises:
         SystemExit: they are of another exam.
     """
-    scores = pd.read_parquet(known)
+    rows = pd.read_parquet(known).to_dict("records")
     drawn_by = draw_second if told["second"] else draw
-    for row in scores.to_dict("records"):
+    for row in rows:
         drawn = drawn_by(int(row["index"]), told["seed"])
-        if (drawn.system, drawn.noise, drawn.condition) != (row["system"], row["noise"], row["condition"]):
+        if (drawn.system, drawn.kind, drawn.noise, drawn.condition) != tuple(
+            row[name] for name in ("system", "kind", "noise", "condition")
+        ):
             raise SystemExit(f"--known {known}: set {row['index']} is none of the exam with seed {told['seed']}")
-        if not score_file(out, drawn.index).exists():
+    for row in rows:
+        if not score_file(out, int(row["index"])).exists():
             keep(out, {name: value for name, value in row.items() if not pd.isna(value)})
 
 

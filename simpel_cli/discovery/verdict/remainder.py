@@ -6,6 +6,7 @@ import numpy as np
 
 from simpel_cli.discovery.search.sets.selection import Selection
 from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.unexplained.dependent_parameters import label_of
 from simpel_cli.discovery.search.unexplained.disturbances import Disturbance
 from simpel_cli.discovery.search.unexplained.drifts import OVER, Drift
 from simpel_cli.discovery.search.unexplained.function_screening import changed_by
@@ -101,20 +102,17 @@ def _function(search: Search, selection: Selection) -> dict[str, Any] | None:
 
 def _dependent(search: Search, chosen: Trial, term: Term, gain: float) -> dict[str, Any]:
     """Describe a parameter that depends on a state or an input."""
-    effects = [search.terms[t] for t in chosen.terms]
-    augmented = augment(search.plan.augmented.model, [*effects, term], search.plan.augmented.measured)
-    acts_on = max(changed_by(augmented, term), key=lambda name: search.plan.scales.rate[name])
-    label = next(
-        (f"{k.label} of {t.effect}" for t in effects for k in t.parameters if k.name == term.acts_on), term.acts_on
-    )
+    effects, scales = [search.terms[t] for t in chosen.terms], search.plan.scales
+    changed = changed_by(augment(search.plan.augmented.model, [*effects, term], search.plan.augmented.measured), term)
+    acts_on = max(changed, key=lambda name: changed[name] / scales.rate[name])
     return {
         "acts_on": acts_on,
         "depends_on": list(term.depends_on),
         "rms": noise_of(search, chosen)[1] / np.sqrt(search.plan.augmented.model.dt),
         "unit": _unit(search, acts_on),
         "log_evidence_gain": gain,
-        "parameter": label,
-        "description": f"a parameter is no constant: {label} depends on {' and '.join(term.depends_on)}",
+        "parameter": label_of(term.acts_on, effects),
+        "description": f"a parameter is no constant: {term.meaning}",
     }
 
 

@@ -72,6 +72,10 @@ class Coordinates(NamedTuple):
         v = self.low[index] + z * (self.high[index] - self.low[index])
         return float(np.exp(v)) if self.log[index] else float(v)
 
+    def span(self, index: int, z: float) -> float:
+        """Return by how much a value may move, in its unit: its range, or itself where the logarithm has one."""
+        return self.value(index, z) if self.log[index] else float(self.high[index] - self.low[index])
+
     def sd_of_prior(self) -> Float[Array, " n"]:
         """Standard deviation of the normal priors in unit coordinates, inf where uniform."""
         return jnp.where(jnp.asarray(self.normal), 1 / (2 * CUT), jnp.inf)

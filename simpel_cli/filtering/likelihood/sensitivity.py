@@ -9,7 +9,8 @@ way of the slopes F, is left out.
 Reference: Jazwinski (1970), Stochastic processes and filtering theory, ch. 8 (the filter's equations, linearised).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import casadi
 import numpy as np
@@ -18,24 +19,23 @@ from simpel_cli.filtering.likelihood.augmented import Augmented
 from simpel_cli.filtering.likelihood.track import Track
 from simulators.effects import Term
 
+Forces: TypeAlias = Mapping[int, tuple[np.ndarray, np.ndarray]]  # row of the state -> at filtered, at predicted states
+
 
 def shifts(
-    track: Track, ok: np.ndarray, force: np.ndarray, following: np.ndarray, row: int, dt: float,
-    reading: np.ndarray | None = None,
+    track: Track, ok: np.ndarray, forces: Forces, dt: float, reading: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
     """Return the change of every innovation per unit of each force, (W, T, ny, n); 0 where nothing was measured.
 
     Args:
         track: of the filter, (W, T, ...) each.
         ok: (W, T, ny) whether it was measured.
-        force: (W, T, n) at the filtered states, per second.
-        following: (W, T, n) at the states predicted from them.
-        row: of the state whose rate the forces act on.
+        forces: what each adds to these rates, per second: (W, T, n) at the filtered states, and at those predicted from them.
         dt: s.
         reading: (W, T, ny, n) what is added to what sensors read; None: nothing.
     """
     count, rows, nx = track.mean.shape
-    n = force.shape[-1]
+    n = next(iter(forces.values()))[0].shape[-1] if reading is None else reading.shape[-1]
     d = np.zeros((count, nx, n))
     found = np.zeros((*ok.shape, n))
     for k in range(rows):
@@ -51,33 +51,38 @@ def shifts(
             d = d + pull[:, :, None] * change[:, None]
             cov = cov - pull[:, :, None] * gain[:, None]
         f = track.jacobian[:, k]
-        d = np.einsum("wij,wjn->win", f, d) + dt / 2 * f[:, :, row, None] * force[:, k, None]
-        d[:, row] += dt / 2 * following[:, k]
+        d = np.einsum("wij,wjn->win", f, d)
+        for row, (here, there) in forces.items():
+            d += dt / 2 * f[:, :, row, None] * here[:, k, None]
+            d[:, row] += dt / 2 * there[:, k]
     return found
 
 
 def waves(
-    augmented: Augmented, term: Term, p: np.ndarray, points: Sequence[tuple[np.ndarray, np.ndarray]], acts_on: str = ""
-) -> list[np.ndarray]:
-    """Return what each weight of a function adds to a rate, per standard deviation of its prior, (..., n) per entry.
+    augmented: Augmented, terms: Sequence[Term], p: np.ndarray, points: Sequence[tuple[np.ndarray, np.ndarray]],
+    rows: Sequence[int],
+) -> Forces:  # fmt: skip
+    """Return what each weight of functions adds to rates, per standard deviation of its prior, (..., n) per row and point.
 
     Args:
-        augmented: a model that has the term.
-        term: a function without a name: linear in its parameters, which have normal priors.
+        augmented: a model that has the terms.
+        terms: functions without a name: linear in their parameters, which have normal priors.
         p: (dp,) values of all parameters.
-        points: states (..., nx) and inputs (..., nu).
-        acts_on: state whose rate it is; empty: that of the term.
+        points: two, states (..., nx) and inputs (..., nu): filtered, and predicted from them.
+        rows: of the state, whose rates are asked.
     """
     function = augmented.function
     x, u, q = (augmented.model.symbol.sym(n, function.size1_in(i)) for i, n in enumerate("xup"))
-    row = [s.name for s in augmented.model.states].index(acts_on or term.acts_on)
-    slope = casadi.jacobian(function(x, u, q)[0][row], q)[:, augmented.rows(term)]
-    program = casadi.Function("waves", [x, u, q], [casadi.densify(slope).T])
-    sd = np.array([(parameter.high - parameter.low) / 4 for parameter in term.parameters])
+    weights = [row for term in terms for row in augmented.rows(term)]
+    slope = casadi.jacobian(function(x, u, q)[0], q)[list(rows), weights]
+    program = casadi.Function("waves", [x, u, q], [casadi.vec(casadi.densify(slope))])
+    sd = np.array([(parameter.high - parameter.low) / 4 for term in terms for parameter in term.parameters])
     found = []
     for states, inputs in points:
         # a model may have no input
         flat = tuple(a.reshape(int(np.prod(states.shape[:-1])), a.shape[-1]).T for a in (states, inputs))
-        value = np.asarray(program(*flat, np.tile(p[:, None], flat[0].shape[1])))
-        found.append(np.nan_to_num(value.T * sd, posinf=0.0, neginf=0.0).reshape(*states.shape[:-1], len(sd)))
-    return found
+        value = np.asarray(program(*flat, np.tile(p[:, None], flat[0].shape[1]))).reshape(len(sd), len(rows), -1)
+        value = np.nan_to_num(value * sd[:, None, None], posinf=0.0, neginf=0.0)
+        found.append(np.moveaxis(value, 0, -1).reshape(len(rows), *states.shape[:-1], len(sd)))
+    here, there = found
+    return {row: (here[i], there[i]) for i, row in enumerate(rows)}

@@ -111,7 +111,7 @@ def _columns(level: Level, frequencies: np.ndarray, row: int, dt: float) -> np.n
     phase = 2 * np.pi * frequencies * np.arange(rows + 1)[:, None]
     force = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)  # (T + 1, 2F)
     here, there = (np.broadcast_to(f, (count, *f.shape)) for f in (force[:-1], force[1:]))
-    columns = shifts(level.track, level.per_std > 0, here, there, row, dt) * level.per_std[..., None]
+    columns = shifts(level.track, level.per_std > 0, {row: (here, there)}, dt) * level.per_std[..., None]
     # the force is taken for a straight line within a row, of which the mean is smaller than that of the wave
     straight = np.cos(np.pi * frequencies) / np.sinc(frequencies)
     return columns.reshape(count, -1, 2, len(frequencies)) / straight

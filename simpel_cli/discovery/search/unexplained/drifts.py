@@ -25,7 +25,7 @@ from simulators.groups import MEMBER, SPREAD
 OVER, BETWEEN = "over an episode", "from episode to episode"
 SIZES = (0.5, 0.15, 0.05, 0.015)  # of the parameter's range
 CERTAIN = 10.0  # nats that it has to earn: no episode was held out for it
-HALF = 0.5  # of what effects explain: fitted, a drift has explained twice what it promises to first order
+HALF = 0.5  # of what effects explain: fitted, what is no constant has explained twice what it promises to first order
 LEAST_EPISODES = 3  # of which one can say that they differ
 
 
@@ -55,12 +55,13 @@ class Drift(NamedTuple):
         return f"{self.parameter} {'drifts' if self.how == OVER else 'differs'} {self.how}, {by} {self.unit}".rstrip()
 
 
-def stands_for(drift: Drift | None, base: Trial, chosen: Trial) -> bool:
-    """Whether episodes that differ, in the simulator alone, explain as much as all the effects that were chosen instead.
+def stands_for(drift: Drift | None, base: Trial, chosen: Trial, known: float = 0.0) -> bool:
+    """Whether episodes that differ, in the simulator alone, explain as much as all that was chosen instead.
 
-    What drifts over an episode is fitted beside the effects (`instead_of_drifts`).
+    What drifts over an episode is fitted beside the effects (`instead_of_drifts`). known: evidence of a function that was
+    accepted beside the effects, nats.
     """
-    effects = chosen.optimum.log_evidence - base.optimum.log_evidence
+    effects = chosen.optimum.log_evidence - base.optimum.log_evidence + known
     return drift is not None and drift.how == BETWEEN and bool(chosen.terms) and drift.gain > effects - TIE
 
 
@@ -105,8 +106,7 @@ def _drifts(levels: NoiseProfile) -> list[Drift]:
             moves = _moves(level, plan.augmented, slopes, p, progress, model.dt)  # (names, W, T, ny, 2)
             for k, i in enumerate(names):
                 q = model.params[i]
-                span = float(plan.coordinates.high[i] - plan.coordinates.low[i])
-                span = q.high - q.low if plan.coordinates.log[i] else span
+                span = plan.coordinates.span(i, float(z[i]))
                 over, alike = moves[k, ..., 1], moves[k, ..., 0]
                 for how in ways:
                     columns = over[..., None] if how == OVER else alike[..., None] * own[:, None, None]
@@ -167,14 +167,15 @@ def _moves(
 
     here, there = at(mean), at(following)
     later = progress + (progress[:, 1:2] - progress[:, :1])
-    found = np.zeros((len(here), count, rows, level.error.shape[2], 2))
+    forces = {}
     for i in range(nx):
-        if not (here[:, i].any() or there[:, i].any()):
-            continue
-        force, after = (
-            np.concatenate([np.moveaxis(f[:, i], 0, -1), np.moveaxis(f[:, i] * w, 0, -1)], axis=-1)
-            for f, w in ((here, progress), (there, later))
-        )  # (W, T, 2 names)
-        moved = shifts(level.track, level.per_std > 0, force, after, i, dt)
-        found += np.moveaxis(moved.reshape(*moved.shape[:3], 2, -1), (3, 4), (4, 0))
-    return found * level.per_std[None, ..., None]
+        if here[:, i].any() or there[:, i].any():
+            force, after = (
+                np.concatenate([np.moveaxis(f[:, i], 0, -1), np.moveaxis(f[:, i] * w, 0, -1)], axis=-1)
+                for f, w in ((here, progress), (there, later))
+            )  # (W, T, 2 names)
+            forces[i] = force, after
+    if not forces:
+        return np.zeros((len(here), count, rows, level.error.shape[2], 2))
+    moved = shifts(level.track, level.per_std > 0, forces, dt)
+    return np.moveaxis(moved.reshape(*moved.shape[:3], 2, -1), (3, 4), (4, 0)) * level.per_std[None, ..., None]

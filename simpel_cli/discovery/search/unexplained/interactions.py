@@ -16,19 +16,18 @@ from simpel_cli.discovery.search.sets.selection import worth
 from simpel_cli.discovery.search.smaller import fitted_again, small_search
 from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.discovery.search.unexplained.dependent_parameters import dependent_parameters
+from simpel_cli.discovery.search.unexplained.drifts import HALF
 from simpel_cli.discovery.search.unexplained.function_screening import Promise, promised
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
-from simpel_cli.filtering.likelihood.fit import Hypothesis
 from simpel_cli.filtering.setup import Key, Setup, key_of
 from simulators.effects import Term, functions_of_two
 from simulators.effects.term import PARAMETER
-from simulators.groups import slots_of
+from simulators.effects.unnamed import arguments_of
 
 BASES = (2, 4)  # waves per argument: a function that needs few is seen sooner with few
 MOST_FITTED = 2
 SHARE = 0.5  # of the largest promise, for a second one to be fitted
 MOST_ARGUMENTS = 10
-HALF = 0.5  # of what effects explain: to first order a function promises half of what it then explains, or more
 
 
 class Interaction(NamedTuple):
@@ -67,17 +66,10 @@ def interaction(
     """
     search, assessor, chosen = levels.search, levels.assessor, levels.chosen
     model = search.plan.augmented.model
-    slots = sum(len(column) for column in slots_of(model))  # which group a row is of is no argument
-    brought = {store.name for t in search.terms for store in t.stores}  # a state that is a guess itself is no argument
-    if len(model.states) - len(brought) + len(model.inputs) - slots > MOST_ARGUMENTS:
+    brought = {store.name for t in search.terms for store in t.stores}
+    if len(arguments_of(model)) - len(brought) > MOST_ARGUMENTS:
         return None
-    here: set[Key] = {key_of(t) for t in search.terms}
-    every = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
-    every += [t for n in BASES for t in dependent_parameters(search, chosen, search.plan.scales, n)]
-    terms = [t for t in every if not brought & {t.acts_on, *t.depends_on}]
-    going = _worth_a_fit(promised(levels, terms), terms, known + ACCEPT)
-    if chosen.terms:
-        going += [t for t in _instead(alone, chosen, brought) if key_of(t) not in [*map(key_of, going)]]
+    going, least = _screened(levels, alone, known)
     if not going:
         return None
     report("is it that " + ", or that ".join(map(in_words, going)))
@@ -89,21 +81,39 @@ def interaction(
     own, names = before.terms, [key_of(t) for t in small.terms]
     trials = small.add(before, [names.index(key_of(t)) for t in going]).trials
     search.tried += len(going)
-    settled = [found for trial in trials if (found := _needed(small, trial)) is not None]
-    if not settled:
-        return None
-    after = max(settled, key=worth)
-    new = max(after.terms)
-    # so that the smaller model has had every chance that the larger one had
-    start = Hypothesis(small.off(trials[0].optimum.z, trials[0].terms[-1:]), small.free(own), small.ones)
-    before = small.best(own, small.fitter([start]))
-    if not after.optimum.log_evidence - before.optimum.log_evidence > known + ACCEPT:
-        return None
-    rest = tuple(t for t in own if t in after.terms)
-    before = small.best(rest, small.fitter(small.less(after, rest)))
-    gain = after.optimum.log_evidence - before.optimum.log_evidence
-    (judged,) = gates(small, assessor.of(plan), after, [before])
-    return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
+    settled = [(after, trial.terms[-1]) for trial in trials for after in _settled(small, trial)]
+    before = small.best(own, ())  # which has had every chance that the larger ones had
+    for after, new in sorted(settled, key=lambda found: -worth(found[0])):
+        rest = tuple(t for t in own if t in after.terms)
+        earned = after.optimum.log_evidence - before.optimum.log_evidence
+        if not earned > (least if rest == own else known + ACCEPT):  # an effect was one of many, too
+            continue
+        less = before if rest == own else small.best(rest, small.fitter(small.less(after, rest)))
+        judged, *instead_of = gates(small, assessor.of(plan), after, [less] + ([before] if rest != own else []))
+        if any(gate.harm or gate.high < 0 for gate in instead_of):  # than the effects that would go it does worse
+            continue
+        gain = after.optimum.log_evidence - less.optimum.log_evidence
+        return Interaction(small.terms[new], tuple(i for i, t in enumerate(own) if t in rest), float(gain), judged)
+    return None
+
+
+def _screened(levels: NoiseProfile, alone: NoiseProfile, known: float) -> tuple[list[Term], float]:
+    """Return the functions that are worth a fit, beside the effects or in their place, and what one has to earn, nats."""
+    search, chosen = levels.search, levels.chosen
+    model = search.plan.augmented.model
+    here: set[Key] = {key_of(t) for t in search.terms}
+    every = [t for n in BASES for t in functions_of_two(model, search.plan.scales, n) if key_of(t) not in here]
+    every += dependent_parameters(search, chosen, BASES)
+    brought = {store.name for t in search.terms for store in t.stores}  # a state that is a guess itself is no argument
+    terms = [t for t in every if not brought & {t.acts_on, *t.depends_on}]
+    least = known + ACCEPT + float(np.log(max(len({key_of(t) for t in terms}), 1)))  # each is as probable as the others
+    going = _worth_a_fit(promised(levels, terms), terms, least)
+    if chosen.terms:
+        instead = [t for t in terms if t.kind == PARAMETER and t.acts_on in [q.name for q in model.params]]
+        effects = chosen.optimum.log_evidence - alone.chosen.optimum.log_evidence
+        more = _worth_a_fit(promised(alone, instead), instead, max(HALF * effects, least))
+        going += [t for t in more if key_of(t) not in [*map(key_of, going)]]
+    return going, least
 
 
 def in_words(term: Term) -> str:
@@ -111,30 +121,14 @@ def in_words(term: Term) -> str:
     return term.meaning if term.kind == PARAMETER else f"a function of {' and '.join(term.depends_on)} acts"
 
 
-def _needed(small: Search, whole: Trial) -> Trial | None:
-    """Return a function with what earns its place beside it of the chosen effects; None where it earns none itself.
+def _settled(small: Search, whole: Trial) -> list[Trial]:
+    """Return a model with a function as it is, and with those of its effects alone that earn their place beside it.
 
     An effect that was named for want of the function goes, but not one of whose size the function is a part.
     """
-    new = whole.terms[-1]
-    after = small.prune(whole)[0]
-    if not {t for t in whole.terms[:-1] if _is_of(small.terms[new], small.terms[t])} <= {*after.terms}:
-        after = whole
-    return after if new in after.terms else None
-
-
-def _is_of(function: Term, effect: Term) -> bool:
-    """Whether a function is what adds to a parameter of an effect."""
-    return function.acts_on in [k.name for k in effect.parameters]
-
-
-def _instead(alone: NoiseProfile, chosen: Trial, brought: set[str]) -> list[Term]:
-    """Return the parameters of the simulator that promise, as functions, a good part of what the chosen effects explain."""
-    search = alone.search
-    terms = [t for n in BASES for t in dependent_parameters(search, alone.chosen, search.plan.scales, n)]
-    terms = [t for t in terms if not brought & {*t.depends_on}]
-    effects = chosen.optimum.log_evidence - alone.chosen.optimum.log_evidence
-    return _worth_a_fit(promised(alone, terms), terms, max(HALF * effects, ACCEPT))
+    new, after = whole.terms[-1], small.prune(whole)[0]
+    owners = {t for t in whole.terms[:-1] if small.terms[new].acts_on in [k.name for k in small.terms[t].parameters]}
+    return [whole] if after.terms == whole.terms or not owners | {new} <= {*after.terms} else [after, whole]
 
 
 def _worth_a_fit(promises: Sequence[Promise], terms: Sequence[Term], least: float) -> list[Term]:

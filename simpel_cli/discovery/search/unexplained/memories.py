@@ -206,11 +206,11 @@ def _earned(
     there = course.at(course.slope, following, level.inputs, np.roll(state, -1, axis=1))
     ok = level.per_std > 0
     if course.channel is None:
-        moved = shifts(level.track, ok, here, there, row, dt)
+        moved = shifts(level.track, ok, {row: (here, there)}, dt)
     else:
         reading = np.zeros((*ok.shape, here.shape[-1]))
         reading[:, :, course.channel] = here
-        moved = shifts(level.track, ok, 0 * here, 0 * there, row, dt, reading)
+        moved = shifts(level.track, ok, {}, dt, reading)
     span, ways = strength
     columns = span * moved * level.per_std[..., None]
     flat, known = columns.reshape(level.error.size, -1), level.known.reshape(level.error.size, -1)
