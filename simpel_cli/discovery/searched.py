@@ -352,15 +352,10 @@ def _with(
     levels, alone_levels = (NoiseProfile(search, assessor, t) for t in (selection.chosen, selection.base))
     attach_said = partial(attach, saying(model, between_rows))
     # what simulations have chosen need not be worth anything one row ahead: no function may take its place there
-    if by_simulations is None and not ground.budget.over(
-        "functions of two arguments, and parameters that depend on one"
-    ):
+    if by_simulations is None and not ground.budget.over("functions of two arguments, dependent parameters"):
         selection, gates = with_interactions(levels, alone_levels, selection, gates, attach_said, options, terminal)
-        levels = (
-            levels
-            if levels.chosen.terms == selection.chosen.terms
-            else NoiseProfile(search, assessor, selection.chosen)
-        )
+        if levels.chosen.terms != selection.chosen.terms:
+            levels = NoiseProfile(search, assessor, selection.chosen)
     alone = drifting(alone_levels, (BETWEEN,)) if selection.chosen.terms else None
     again = None
     if (promising := remembering(levels, alone_levels)) is not None:
