@@ -363,9 +363,8 @@ def _with(
         again = again and again._replace(simulated=begun)
         if again is not None and not model.groups:
             return again
-    known = selection.remainder[1] if selection.remainder else 0.0
-    # nor may a drift
-    if by_simulations is None and stands_for(alone, selection.base, selection.chosen, known):
+    told = selection.remainder[1] if selection.remainder else 0.0  # nor may a drift take what these explain, and this
+    if by_simulations is None and stands_for(alone, selection.base, selection.chosen, told):
         terminal.line("a parameter that is no constant explains as much as these effects", "search")
         selection, gates = cut(search, selection, [])._replace(remainder=None), []
         levels = NoiseProfile(search, assessor, selection.chosen)
