@@ -128,9 +128,10 @@ def looked(data: Recording, folder: Path) -> tuple[Search, Assessor, Selection, 
 
 def said(data: Recording, search: Search, assessor: Assessor, left: Selection) -> dict[str, Any]:
     windows = windows_of_tests(search.plan, data.test, ())
-    before, learnt = (assessor(left.chosen.optimum.z, w) for w in (windows, search.plan.windows))
+    before = assessor(left.base.optimum.z, windows)
+    after, learnt = (assessor(left.chosen.optimum.z, w) for w in (windows, search.plan.windows))
     left_over = remainder_of(search, left, None, learnt)
-    return verdict_of(search, left, [], before, before, left_over, windows, data.checks, 10, 0.0)
+    return verdict_of(search, left, [], before, after, left_over, windows, data.checks, 10, 0.0)
 
 
 @pytest.mark.slow
@@ -153,7 +154,10 @@ def test_a_mean_friction_is_named_and_the_rest_remains(tmp_path: Path) -> None:
     found = said(data, search, assessor, left)
     assert found["verdict"] == "effect"
     assert [e["name"] for e in found["effects"]] == ["friction"]
-    assert found["remainder"]["depends_on"] == ["s", "v"]
+    assert found["remainder"]["parameter"] == "c of friction on v"
+    assert found["remainder"]["depends_on"] == ["s"]
+    assert found["remainder"]["acts_on"] == "v"
+    assert found["remainder"]["log_evidence_gain"] > 100
     without = cut(search, left, ())
     assert (without.chosen.terms, without.classes, without.gains) == ((), (), ())
     assert without.base == without.chosen == without.path[-1]
