@@ -115,15 +115,18 @@ def test_a_mass_that_cancels_out_of_a_weight_is_no_function_of_the_angle(symbol:
     assert slopes.linear == {"g"}
 
 
-def two_nodes() -> Model:
-    """A node that warms a second one, which loses `a` of what it is warmer than its surroundings."""
+def nodes(parameter: str, first: str, second: str) -> Model:
+    """Two nodes that warm each other, with a coefficient of that name and the loss `a` of the second one."""
+    both = {"unit": "degC", "range": [-3, 5]}
     return Declared(
-        "nodes", dt=DT,
-        states={"first": {"unit": "degC", "range": [-3, 5]}, "second": {"unit": "degC", "range": [-3, 5]}},
-        inputs={"u": {"unit": "1", "range": [-3, 3]}},
-        parameters={"k": {"unit": "degC/s", "range": [0.5, 1.5]}, "a": {"unit": "1/s", "range": [0.2, 1.2]}},
-        dynamics={"first": "k*u - 0.5*first", "second": "0.8*first - a*second"},
+        "nodes", dt=DT, states={"first": both, "second": both}, inputs={"u": {"unit": "1", "range": [-3, 3]}},
+        parameters={name: {"unit": "1/s", "range": [0.2, 1.5]} for name in (parameter, "a")},
+        dynamics={"first": first, "second": second},
     ).model()  # fmt: skip
+
+
+two_nodes = partial(nodes, "h", "h*u - 0.5*first", "0.8*first - a*second")
+exchange = partial(nodes, "k", "u - k*(first - second)", "k*(first - second) - a*second")  # k acts on both rates
 
 
 def warmed(share: float, seed: int) -> Recording:
@@ -195,26 +198,10 @@ def test_a_loss_that_depends_on_another_node_is_said_to_be_that(
 
 
 def test_a_parameter_that_acts_on_two_rates_changes_both() -> None:
-    model = Declared(
-        "two", dt=DT,
-        states={"a": {"unit": "m", "range": [-3, 3]}, "b": {"unit": "m", "range": [-3, 3]}},
-        parameters={"k": {"unit": "1/s", "range": [0.5, 1.5]}, "m": {"unit": "1/s", "range": [0.5, 1.5]}},
-        dynamics={"a": "-k*(a - b)", "b": "k*(a - b) - m*b"},
-    ).model()  # fmt: skip
-    term, other = (dependent(model, scales_of(model), (name, name), "b", "1/s", 1.0, 2) for name in "km")
-    assert [*changed_by(augment(model, [term], ["a", "b"]), term)] == ["a", "b"]
-    assert [*changed_by(augment(model, [other], ["a", "b"]), other)] == ["b"]
-
-
-def exchange() -> Model:
-    """Two nodes that exchange heat: `k` acts on both rates."""
-    return Declared(
-        "exchange", dt=DT,
-        states={"first": {"unit": "degC", "range": [-3, 5]}, "second": {"unit": "degC", "range": [-3, 5]}},
-        inputs={"u": {"unit": "1", "range": [-3, 3]}},
-        parameters={"k": {"unit": "1/s", "range": [0.2, 1.2]}, "a": {"unit": "1/s", "range": [0.2, 1.2]}},
-        dynamics={"first": "u - k*(first - second)", "second": "k*(first - second) - a*second"},
-    ).model()  # fmt: skip
+    model = exchange()
+    term, other = (dependent(model, scales_of(model), (name, name), "second", "1/s", 1.0, 2) for name in "ka")
+    assert [*changed_by(augment(model, [term], ["first", "second"]), term)] == ["first", "second"]
+    assert [*changed_by(augment(model, [other], ["first", "second"]), other)] == ["second"]
 
 
 def test_what_a_parameter_of_two_rates_does_to_the_innovations() -> None:
