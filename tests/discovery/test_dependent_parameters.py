@@ -13,10 +13,10 @@ from simpel_cli.discovery.search.acceptance import gated_selection, with_interac
 from simpel_cli.discovery.search.gate.held_out import gates as gates_of
 from simpel_cli.discovery.search.sets.forward import select
 from simpel_cli.discovery.search.settings import Discovery
-from simpel_cli.discovery.search.trials import Search, Trial
+from simpel_cli.discovery.search.trials import ACCEPT, Search, Trial
 from simpel_cli.discovery.search.unexplained import interactions
 from simpel_cli.discovery.search.unexplained.dependent_parameters import dependent_parameters, label_of, slopes_of
-from simpel_cli.discovery.search.unexplained.function_screening import changed_by
+from simpel_cli.discovery.search.unexplained.function_screening import Promise, changed_by
 from simpel_cli.discovery.search.unexplained.interactions import _settled
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
 from simpel_cli.discovery.verdict.remainder import left_in_words, remainder_of
@@ -195,6 +195,13 @@ def test_a_loss_that_depends_on_another_node_is_said_to_be_that(
     monkeypatch.setattr(interactions, "gates", refused)
     beside = interactions.interaction(chosen, alone, attach, 4)
     assert beside is None or beside.kept == (0,)
+    # in the place of effects a function has to earn what any function has to, beside them what one of so many has to
+    going, least = interactions._screened(chosen, alone, 0.0)
+    assert least > ACCEPT + np.log(3)
+    monkeypatch.setattr(interactions, "gates", gates_of)
+    monkeypatch.setattr(interactions, "_screened", lambda *_: (going, 1e6))
+    assert interactions.interaction(chosen, alone, attach, 4).kept == ()
+    assert interactions.interaction(chosen, alone, attach, 4, known=1e6) is None
 
 
 def test_a_parameter_that_acts_on_two_rates_changes_both() -> None:
@@ -231,11 +238,14 @@ def test_what_a_parameter_of_two_rates_does_to_the_innovations() -> None:
 
 
 def test_a_parameter_of_two_rates_is_asked_as_a_function_of_any_one_argument() -> None:
-    """No force on one rate can stand for it; the loss `a` as a function of `second` is one."""
-    plan = setup(exchange(), warmed(0.0, 0), (), [], 2)
+    """No force on one rate can stand for it; the loss `a` as a function of `second` is one. What is not free is not asked."""
+    plan = setup(nodes("k", "u - k*first", "k*first - a*second"), warmed(0.0, 0), (), [], 2)
     search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8))
-    asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, search.base(), [2])}
+    base = search.base()
+    asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, base, [2])}
     assert asked == {("k", "first"), ("k", "second"), ("k", "u"), ("a", "first"), ("a", "u")}
+    still = base._replace(optimum=base.optimum._replace(free=base.optimum.free[1:]))
+    assert {t.acts_on for t in dependent_parameters(search, still, [2])} == {"a"}
 
 
 class _Pruning(Search):
@@ -263,6 +273,24 @@ def test_effects_beside_a_function_go_where_they_earn_nothing_but_not_the_one_th
     assert function.meaning == "c of friction on v depends on angle"
     assert label_of(name, [load, friction]) == "c of friction on v"
     assert label_of("d", [load, friction]) == "d"
+
+
+def test_what_stands_for_effects_is_sought_in_the_simulator_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the effects nothing promises anything; without them what promises half of what they explain is worth a fit."""
+    plan = setup(two_nodes(), warmed(0.0, 0), (), [OVERFLOW], 2)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8))
+    base = search.base()
+    better = base.optimum._replace(log_evidence=base.optimum.log_evidence + 100.0)
+    chosen, assessor = Trial((0,), better), Assessor(plan, 3)
+    levels, alone = NoiseProfile(search, assessor, chosen), NoiseProfile(search, assessor, base)
+
+    def promised(asked: NoiseProfile, terms: list[Term]) -> list[Promise]:
+        worth = {("a", "first"): 60.0, ("h", "second"): 40.0}
+        return [Promise(worth.get((t.acts_on, *t.depends_on), 0.0) if asked is alone else 0.0, 1.0) for t in terms]
+
+    monkeypatch.setattr(interactions, "promised", promised)
+    going, _ = interactions._screened(levels, alone, 0.0)
+    assert [(t.acts_on, *t.depends_on) for t in going] == [("a", "first")]
 
 
 def test_of_a_logarithm_a_function_may_be_as_large_as_the_value() -> None:
