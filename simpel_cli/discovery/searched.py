@@ -352,7 +352,7 @@ def _with(
     levels, alone_levels = (NoiseProfile(search, assessor, t) for t in (selection.chosen, selection.base))
     attach_said = partial(attach, saying(model, between_rows))
     # what simulations have chosen need not be worth anything one row ahead: no function may take its place there
-    if by_simulations is None and not ground.budget.over("functions of two arguments, dependent parameters"):
+    if by_simulations is None and not ground.budget.over("functions of two arguments"):
         selection, gates = with_interactions(levels, alone_levels, selection, gates, attach_said, options, terminal)
         if levels.chosen.terms != selection.chosen.terms:
             levels = NoiseProfile(search, assessor, selection.chosen)
