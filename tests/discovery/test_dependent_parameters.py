@@ -1,5 +1,6 @@
 """Parameters that depend on a state or an input: what they add, which are asked, what they promise, what is said of them."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from simpel_cli.filtering.likelihood.sensitivity import shifts, waves
 from simpel_cli.filtering.setup import setup
 from simpel_cli.runs.console import Terminal
 from simulators.effects import Expression, Scales, Term, dependent
+from simulators.groups import MEMBER, SPREAD
 from simulators.model import Declared, Model
 from simulators.quantity import Quantity
 
@@ -273,6 +275,23 @@ def test_effects_beside_a_function_go_where_they_earn_nothing_but_not_the_one_th
     assert function.meaning == "c of friction on v depends on angle"
     assert label_of(name, [load, friction]) == "c of friction on v"
     assert label_of("d", [load, friction]) == "d"
+
+
+def test_of_an_effect_its_coefficients_are_asked_and_of_groups_neither_spread_nor_members() -> None:
+    """The edge of an overflow is no coefficient."""
+    plan = setup(two_nodes(), warmed(0.0, 0), (), [OVERFLOW], 2)
+    search = Search(plan, Fitter(plan.rule, plan.coordinates, plan.windows, side_by_side=2, width=8))
+    base = search.base()
+    free = base.optimum.free + tuple(search.all_rows(0))
+    chosen = Trial((0,), base.optimum._replace(free=free))
+    asked = {t.acts_on for t in dependent_parameters(search, chosen, [2])}
+    of_effect = [k for k in search.terms[0].parameters if k.name in asked]
+    assert [k.label for k in of_effect] == ["c"]
+    model = plan.augmented.model
+    for role in (SPREAD, MEMBER):
+        params = tuple(q._replace(role=role) if q.name == "a" else q for q in model.params)
+        search.plan = plan._replace(augmented=plan.augmented._replace(model=replace(model, params=params)))
+        assert {t.acts_on for t in dependent_parameters(search, base, [2])} == {"h"}
 
 
 def test_what_stands_for_effects_is_sought_in_the_simulator_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,6 +104,7 @@ def test_a_drift_stands_for_effects_that_explain_no_more() -> None:
     found = found._replace(how=BETWEEN)
     assert stands_for(found, base, some)
     assert not stands_for(found, base, more)
+    assert not stands_for(found, base, some, 10.0)  # beside which a function explains more
     assert not stands_for(found, base, base)  # there are no effects
     assert not stands_for(None, base, some)
 

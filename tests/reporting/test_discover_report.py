@@ -215,6 +215,13 @@ def test_evidence_shows_accepted_tied_and_stopped_early(tmp_path: Path) -> None:
     assert "tie:" not in " ".join(t.get_text() for t in figure.axes[1].texts)
 
 
+def test_an_effect_that_was_given_up_later_is_said_to_be_that(tmp_path: Path) -> None:
+    searches.directory(tmp_path, "ambiguous")
+    found = searches.verdict("ambiguous") | {"effects": []}
+    figure = discover_evidence.draw_evidence(found, tmp_path / "candidates.parquet")
+    assert figure.axes[0].get_title(loc="left") == "step 1: + coulomb friction on omega (given up later)"
+
+
 def test_a_step_at_which_several_effects_were_taken_at_once_does_not_say_that_none_was(tmp_path: Path) -> None:
     searches.directory(tmp_path, "ambiguous")
     path = tmp_path / "candidates.parquet"

@@ -31,7 +31,9 @@ def draw_evidence(found: dict[str, Any], path: Path) -> Any:
         best = np.flatnonzero(own["accepted"]).tolist()
         # a search that began with several effects at once has a step at which none of the candidates was taken
         none = "no further effect is accepted" if step == steps[-1] else "several effects together are worth more"
-        what = f"+ {_label(own, best[0])}" if len(best) else none
+        stays = {(e["name"], e["acts_on"]) for e in found["effects"]}
+        later = "" if not best or _key(own, best[0]) in stays else " (given up later)"
+        what = f"+ {_label(own, best[0])}{later}" if best else none
         axis.set_title(f"step {step}: {what}", fontsize=9, loc="left")
     _legend(figure)
     return figure
