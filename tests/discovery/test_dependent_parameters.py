@@ -20,6 +20,7 @@ from simpel_cli.discovery.search.unexplained.dependent_parameters import depende
 from simpel_cli.discovery.search.unexplained.function_screening import Promise, changed_by
 from simpel_cli.discovery.search.unexplained.interactions import _settled
 from simpel_cli.discovery.search.unexplained.noise_profile import NoiseProfile
+from simpel_cli.discovery.verdict import remainder
 from simpel_cli.discovery.verdict.remainder import left_in_words, remainder_of
 from simpel_cli.filtering.errors_ahead import Assessor
 from simpel_cli.filtering.likelihood.augmented import augment
@@ -246,6 +247,9 @@ def test_a_parameter_of_two_rates_is_asked_as_a_function_of_any_one_argument() -
     base = search.base()
     asked = {(t.acts_on, *t.depends_on) for t in dependent_parameters(search, base, [2])}
     assert asked == {("k", "first"), ("k", "second"), ("k", "u"), ("a", "first"), ("a", "u")}
+    of_both = next(t for t in dependent_parameters(search, base, [2]) if t.acts_on == "k")
+    said = remainder._dependent(search, base, of_both, 5.0)  # its slopes are equal: it acts where rates are small
+    assert said["acts_on"] == min(("first", "second"), key=plan.scales.rate.__getitem__)
     still = base._replace(optimum=base.optimum._replace(free=base.optimum.free[1:]))
     assert {t.acts_on for t in dependent_parameters(search, still, [2])} == {"a"}
 

@@ -106,5 +106,6 @@ def test_a_drift_is_named_and_what_no_time_was_left_for_is_said(tmp_path: Path) 
     assert (drift["parameter"], drift["how"]) == ("b", "over an episode")
     assert drift["size"] == pytest.approx(0.4, rel=0.15)
     assert found["remainder"]["depends_on"] == ["time"]
+    assert found["remainder"]["parameter"] == found["drift"]["parameter"]
     assert "functions of two arguments" in found["left_out"]
     assert "Left out for lack of time (discovery.budget)" in found["summary"]
